@@ -8,9 +8,10 @@ from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, write_trajectory
 from eslr_jax.pose.motion import still_motion
+from eslr_jax.terms import FAST
 
 
-def write_run(folder, body, name, scale=1.0, **options):
+def write_run(folder, body, name, scale=1.0):
     """Write a run of six frames: a tank top at rest, stretched, raised, at rest, shrunk, and lowered."""
     folder = folder / name
     folder.mkdir()
@@ -28,7 +29,7 @@ def write_run(folder, body, name, scale=1.0, **options):
         folder / "trajectory.npz",
         TrajectoryFile(frames, velocities, garment.faces, timestep=1 / 30, body=track),
     )
-    scene = prepare_scene(prepare_stored(garment), poses, **options)
+    scene = prepare_scene(prepare_stored(garment), poses, terms=FAST)
     start = dict(zip(("position", "velocity"), np.float32([frames[0], velocities[0]]), strict=True))
     save_scene(folder / "scene.npz", scene.replace(initial_state=scene.initial_state.replace(**start)))
     (folder / "report.json").write_text("{}")

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from commands import eslr
 from foreign_files import write_smpl, write_walker
+from garment_shapes import write_obj
 from other_bodies import smpl_female
 
-from eslr_jax import load_garment, load_motion, pose_body
-from eslr_jax.pipeline.formats.obj import obj_text
-from eslr_jax.pipeline.formats.trajectory import read_trajectory
-from eslr_jax.pose.lbs import skin_garment
+from eslr_jax import load_garment, load_motion, load_trajectory, pose_body, prepare_scene
 
 
 def done(*arguments):
@@ -44,7 +42,7 @@ def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body)
     out = tmp_path / "out"
     report, _ = simulate(out, "--body", avatar / "avatar.glb", "--garment", avatar / "shirt.obj", frames=4)
     assert report["motion"].endswith("avatar.glb")  # its own animation
-    run = read_trajectory(out / "trajectory.npz")
+    run = load_trajectory(out)
     assert run.positions.shape == (4, 1000, 3)
     expected = pose_body(body, load_motion(), arm_abduction=0.0, num_frames=4)
     distance = np.linalg.norm(run.body.positions - np.asarray(expected.positions), axis=-1)
@@ -83,10 +81,10 @@ def test_a_mesh_in_motion_is_a_body(tmp_path, walk):
     np.savez(moving, positions=walk.positions[:5], faces=walk.faces, fps=30)
     # The shirt that the walk starts in: a garment has to fit the first frame.
     shirt = load_garment("tshirt")
-    start = np.asarray(skin_garment(shirt, walk.joint_transforms))[0]
-    garment.write_text(obj_text("shirt", start, np.asarray(shirt.faces)))
+    start = np.asarray(prepare_scene(shirt, walk).initial_state.position)
+    write_obj(garment, (start, np.asarray(shirt.faces)))
     simulate(out, "--body", moving, "--garment", garment, frames=None)
-    run = read_trajectory(out / "trajectory.npz")
+    run = load_trajectory(out)
     np.testing.assert_allclose(run.body.positions, walk.positions[:5], atol=1e-6)
 
 
@@ -116,7 +114,7 @@ def test_a_character_of_200_m_is_scaled_with_a_line_and_wears_a_bundled_garment(
     report, said = simulate(tmp_path / "out", "--body", tmp_path / "giant.glb")
     assert "taken to be in cm" in said
     assert report["motion"].endswith("giant.glb")
-    run = read_trajectory(tmp_path / "out" / "trajectory.npz")
+    run = load_trajectory(tmp_path / "out")
     assert 1.5 < np.ptp(run.body.positions[-1][:, 1]) < 2.2
     assert report["max_principal_stretch"] < 2.0
     assert report["penetration_max_mm"] < 1.0

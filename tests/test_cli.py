@@ -75,20 +75,10 @@ def test_a_term_that_can_not_be_made_is_refused_in_one_line(text, reason):
 @pytest.mark.slow
 def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled there yet
-    words = (
-        "simulate",
-        "--simulator",
-        "physics",
-        "--iterations",
-        20,
-        "--frames",
-        4,
-        "--no-pictures",
-        "--json",
-    )
+    words = ("simulate", "--simulator", "physics", "--iterations", 20, "--frames", 4, "--no-pictures")
     reports = []
     for _ in range(2):
-        result = eslr(*words, "--out", tmp_path / "run")
+        result = eslr(*words, "--json", "--out", tmp_path / "run")
         assert result.returncode == 0, result.stderr
         reports.append((json.loads(result.stdout)["compile_s"], result.stderr))
     (first, told), (second, untold) = reports

@@ -23,14 +23,20 @@ from eslr_jax import (
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.fabric.materials import COTTON, fabric_material
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.pipeline.report.gap import trajectory_states
-from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
+from eslr_jax.simulation.frame import first_problem, frame_inputs
 from eslr_jax.simulation.plan import first_frames
 from eslr_jax.simulation.scene import build_scene
 from eslr_jax.solver.potential import evaluate
 from eslr_jax.terms import CLOTH, Collision, Contact, Gravity
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.worn import REACH
+
+of_first_frame, pressed = jax.jit(first_problem), jax.jit(evaluate)
+
+
+def without_pairs(scene):
+    """Return the terms of a scene but for contact of pairs, which takes long to compile."""
+    return tuple(term for term in scene.terms if not isinstance(term, Contact))
 
 
 def test_frame_zero_is_clear_of_the_body(small_scene):
@@ -41,8 +47,8 @@ def test_frame_zero_is_clear_of_the_body(small_scene):
     assert float(found.distances.min()) > 0
 
 
-def test_what_is_not_asked_for_is_absent(small_garment, small_poses):
-    scene = prepare_scene(small_garment, small_poses)
+def test_what_is_not_asked_for_is_absent(small_garment, small_poses, small_scene):
+    scene = small_scene
     assert scene.pin_targets is None
     assert not scene.term(Contact).has_layers
     options = {"terms": (*CLOTH, Gravity(1.62)), "starts_at_rest": True}
@@ -72,41 +78,46 @@ def test_a_misspelt_option_is_refused(small_garment, small_poses):
         prepare_scene(small_garment, small_poses, integrator="Euler")
 
 
-def test_contacts_are_as_stiff_as_the_fabric_asks_for(small_garment, small_poses):
+def test_contacts_are_as_stiff_as_the_fabric_asks_for(small_scene):
     """The same vertex at the same depth presses with the fabric's share."""
     denim, stiffness = fabric_material("denim"), Collision().stiffness
-    scenes = [prepare_scene(small_garment, small_poses, material=one) for one in (denim, COTTON)]
-    found = [float(jax.jit(first_problem)(scene).data_of(Collision).stiffness) for scene in scenes]
+    fabrics = [jax.tree.map(jnp.asarray, one) for one in (denim, COTTON)]
+    scenes = [small_scene.replace(material=one, terms=without_pairs(small_scene)) for one in fabrics]
+    found = [float(of_first_frame(scene).data_of(Collision).stiffness) for scene in scenes]
     assert found == pytest.approx([float(contact_excess(denim)) * stiffness, stiffness])
     assert found[0] > 5 * stiffness
 
 
-def test_scenes_with_and_without_pieces_can_be_stacked():
+def test_scenes_with_and_without_pieces_and_pins_can_be_stacked():
+    """What one of them needs, all model."""
     layer = square()
     positions, faces = np.asarray(layer.rest_positions), np.asarray(layer.faces)
-    one = make_garment(positions, faces)
+    one = make_garment(positions, faces, is_pinned=np.arange(len(positions)) < 8)
     above = positions + np.array([0, 0.01, 0])
     two = make_garment(np.concatenate([positions, above]), np.concatenate([faces, faces + len(positions)]))
     motion = drifting_ball(4)
     scenes = prepare_scenes([one, two], [motion, motion], [COTTON, COTTON])
     assert len({(scene.term(Contact).rows, scene.term(Contact).has_layers) for scene in scenes}) == 1
+    shapes = [jax.tree.map(np.shape, scene) for scene in scenes]
+    assert shapes[0] == shapes[1]
+    assert all(scene.pin_targets is not None for scene in scenes)
 
 
-def test_what_a_plan_leaves_out_changes_no_force(
-    small_garment, small_poses, small_scene, small_trajectory, monkeypatch
-):
+def test_what_a_plan_leaves_out_changes_no_force(small_garment, small_poses, small_scene, monkeypatch):
     """A scene that is not planned searches every face of the body, and models pins although there are none."""
-    whole = build_scene(small_garment, small_poses, small_scene.material, small_scene.terms)
+    terms = without_pairs(small_scene)
+    whole = jax.jit(build_scene)(small_garment, small_poses, small_scene.material, terms)
     assert whole.pin_targets is not None
     monkeypatch.setattr("eslr_jax.terms.worn.REACH", REACH / 2)  # else all of this small body is in reach
-    near = prepare_scene(small_garment, small_poses, terms=small_scene.terms)
+    near = prepare_scene(small_garment, small_poses, terms=terms)
     assert whole.body.surface.faces.shape[0] > near.body.surface.faces.shape[0]
-    position = small_trajectory.positions[3] + 1e-3
+    # Pressed into the limb, and rubbing on it.
+    start = small_scene.initial_state
+    loaded = start.replace(friction_load=jnp.full_like(start.friction_load, 1e-3))
+    position = 0.9 * start.position + 1e-3
 
-    @jax.jit
     def forces(scene):
-        states, inputs = jax.tree.map(lambda leaf: leaf[2], trajectory_states(small_trajectory, scene))
-        return evaluate(position, frame_problem(scene, states, inputs)).gradient
+        return pressed(position, of_first_frame(scene.replace(initial_state=loaded))).gradient
 
     expected = forces(whole)
     np.testing.assert_allclose(forces(near), expected, atol=1e-5 * np.abs(expected).max())
@@ -118,17 +129,6 @@ def test_the_first_frames_of_a_scene_have_its_inputs(small_scene):
     whole = jax.tree.map(lambda leaf: leaf[:2], frame_inputs(small_scene))
     jax.tree.map(np.testing.assert_array_equal, frame_inputs(short), whole)
     assert first_frames(small_scene, 99).num_frames == small_scene.num_frames
-
-
-def test_scenes_for_a_stack_have_equal_shapes(small_garment, small_poses):
-    from cloth import make_sleeve
-
-    pinned = make_sleeve(is_pinned=np.arange(60) >= 50)
-    material = prepare_scene(small_garment, small_poses).material
-    scenes = prepare_scenes([small_garment, pinned], [small_poses] * 2, [material] * 2)
-    shapes = [jax.tree.map(np.shape, scene) for scene in scenes]
-    assert shapes[0] == shapes[1]
-    assert all(scene.pin_targets is not None for scene in scenes), "what one of them needs, all model"
 
 
 def test_a_limb_that_comes_for_a_fifth_of_a_second_in_a_long_motion_is_searched():

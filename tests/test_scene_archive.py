@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
+from jax.tree_util import Partial
 from own_term import Push
 
 from eslr_jax import AssetError, ConfigError, load_scene, prepare_scene, save_scene, scene_terms
@@ -15,14 +16,15 @@ from eslr_jax.terms import Air, Damping, Ground
 from eslr_jax.terms.air import blowing
 
 
-def all_of_a_scene(*others, substeps=1):
+@pytest.fixture(scope="module")
+def scene():
     garment = square(5, 0.12, is_pinned=np.array([0, 3]))
+    others = blowing((3.0, 0.0, 0.0), 0.3), Damping(0.01), Push(0.5)
     terms = scene_terms(Ground(is_always=True), *others)
-    return prepare_scene(garment, drifting_ball(3), terms=terms, integrator="bdf2", substeps=substeps)
+    return prepare_scene(garment, drifting_ball(3), terms=terms, integrator="bdf2", substeps=2)
 
 
-def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path):
-    scene = all_of_a_scene(blowing((3.0, 0.0, 0.0), 0.3), Damping(0.01), Push(0.5), substeps=2)
+def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path, scene):
     save_scene(tmp_path / "scene.npz", scene)
     again = load_scene(tmp_path / "scene.npz")
     assert jax.tree.structure(again) == jax.tree.structure(scene)
@@ -31,8 +33,8 @@ def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path):
     assert types[0] == types[1]
 
 
-def test_a_term_whose_module_is_not_there_is_named(tmp_path):
-    save_scene(tmp_path / "scene.npz", all_of_a_scene(Push(0.5)))
+def test_a_term_whose_module_is_not_there_is_named(tmp_path, scene):
+    save_scene(tmp_path / "scene.npz", scene)
     code = "import sys, eslr_jax\ntry: eslr_jax.load_scene(sys.argv[1])\nexcept eslr_jax.EslrError as e: print(e)"
     command = [sys.executable, "-c", code, str(tmp_path / "scene.npz")]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -41,8 +43,8 @@ def test_a_term_whose_module_is_not_there_is_named(tmp_path):
     )
 
 
-def test_a_function_of_ones_own_is_refused_when_it_is_written(tmp_path):
-    scene = all_of_a_scene(Air(lambda points, time: 2.0 * points))
+def test_a_function_of_ones_own_is_refused_when_it_is_written(tmp_path, scene):
+    scene = scene.with_term(Air(Partial(lambda points, time: 2.0 * points)))
     with pytest.raises(ConfigError, match=r"scene\.terms\.\d+\.wind is a function of your own"):
         save_scene(tmp_path / "scene.npz", scene)
     assert not list(tmp_path.iterdir())

@@ -78,9 +78,10 @@ def test_a_padded_body_is_found_as_the_body_itself():
 def test_contact_point_moves_with_the_body(sphere):
     _, vertices, surface = sphere
     offset = jnp.array([[0.1, -0.05, 0.02]])
-    query = jnp.array([[0.1, 0.24, 0.0]])
+    query = jnp.array([[0.1, 0.24, 0.0], [0.0, 0.24, 0.1], [0.0, -0.26, 0.0]])
     contacts = find(query, vertices, vertices + offset, surface)
-    np.testing.assert_allclose(contacts.next_points - contacts.points, offset, atol=1e-6)
+    moved = np.asarray(contacts.next_points - contacts.points)
+    np.testing.assert_allclose(moved, np.broadcast_to(offset, moved.shape), atol=1e-6)
     np.testing.assert_allclose(contacts.next_normals, contacts.normals, atol=1e-6)
 
 

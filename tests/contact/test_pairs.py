@@ -1,5 +1,8 @@
 """Pairs of vertices with faces and of edges: distances, pushes and searches against other people's code."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +14,14 @@ from eslr_jax.mesh.surface import prepare_surface
 
 ROWS = 2048
 KINDS = pytest.mark.parametrize("is_edge", [False, True], ids=["faces", "edges"])
+find_pairs = jax.jit(lists.find_pairs, static_argnums=2)
+pushed_apart = jax.jit(pairs.pushed_apart, static_argnums=4)
+
+
+@partial(jax.jit, static_argnums=2)
+def closest(x, ids, is_edge):
+    """Return the closest points of pairs, by the places of vertices and the ids of their corners."""
+    return pairs.closest(pairs.corners_of(x, ids), is_edge)
 
 
 def random_rows(is_edge, scale=0.02):
@@ -40,7 +51,7 @@ def test_distances_are_the_ipc_toolkits(is_edge):
     _, ids, x = random_rows(is_edge)
     squared, _ = toolkit(is_edge)
     known = [np.sqrt(squared(*x[ids[:, row]].astype(float))) for row in range(ROWS)]
-    found = pairs.closest(pairs.corners_of(columns(x), jnp.asarray(ids)), is_edge).distance
+    found = closest(columns(x), jnp.asarray(ids), is_edge).distance
     np.testing.assert_allclose(found, known, rtol=1e-4, atol=1e-7)
 
 
@@ -49,7 +60,7 @@ def test_pushed_ends_are_reached_without_crossing_and_those_that_meet_nothing_st
     table, ids, x = random_rows(is_edge)
     step = np.random.default_rng(2).normal(size=x.shape).astype(np.float32) * 0.012
     is_free = jnp.asarray(np.arange(len(x)) < 3 * ROWS)  # the last corner of every pair stays
-    ends, lack = pairs.pushed_apart(columns(x), columns(x + step), table, is_free, 60)
+    ends, lack = pushed_apart(columns(x), columns(x + step), table, is_free, 60)
     assert float(lack) < 1e-8  # a pair that only comes near may be left undecided
     ends = np.stack(ends, axis=1)
     np.testing.assert_array_equal(ends[3 * ROWS :], (x + step)[3 * ROWS :])
@@ -77,14 +88,14 @@ def test_pushed_ends_are_reached_without_crossing_and_those_that_meet_nothing_st
 @KINDS
 def test_gaps_do_not_shrink_below_the_floor(is_edge):
     table, ids, x = random_rows(is_edge, scale=0.005)
-    near = pairs.closest(pairs.corners_of(columns(x), jnp.asarray(ids)), is_edge)
+    near = closest(columns(x), jnp.asarray(ids), is_edge)
     # The first primitive of every pair goes to 20 micrometres before the second.
     toward = np.stack(near.offset, axis=1) * np.asarray(1 - 2e-5 / near.distance)[:, None]
     first = ids[: 2 if is_edge else 1]
     x[first] -= toward.astype(np.float32)
     is_free = jnp.asarray(np.isin(np.arange(len(x)), first))
-    ends, lack = pairs.pushed_apart(columns(x), columns(x), table, is_free, 60)
-    distance = pairs.closest(pairs.corners_of(ends, jnp.asarray(ids)), is_edge).distance
+    ends, lack = pushed_apart(columns(x), columns(x), table, is_free, 60)
+    distance = closest(ends, jnp.asarray(ids), is_edge).distance
     assert float(lack) == 0
     assert float(distance.min()) >= pairs.FLOOR
 
@@ -103,7 +114,7 @@ def test_the_search_finds_every_pair_that_comes_near_while_vertices_move():
     half = random.normal(size=start.shape).astype(np.float32) * 2e-3
     radius = np.where(np.arange(len(start)) < 144, 2e-3, 0.0).astype(np.float32)
     motion = lists.Motion(columns(start), columns(half), jnp.asarray(radius))
-    found = lists.find_pairs(motion, meshes, 4096)
+    found = find_pairs(motion, meshes, 65536)
     for (rows, is_edge), first, second in zip(
         found.pairs.kinds, (meshes.vertices, meshes.edges), (meshes.faces, meshes.edges), strict=True
     ):
@@ -119,10 +130,9 @@ def test_the_search_finds_every_pair_that_comes_near_while_vertices_move():
         for _ in range(50):  # places within the motion: on the ways, and in the balls around them
             way = start + half * np.float32(random.choice([-1.0, 0.3, 1.0]))
             off = np.sign(random.normal(size=start.shape)) / np.sqrt(3)
-            p = pairs.corners_of(
-                columns((way + radius[:, None] * off).astype(np.float32)), jnp.asarray(ids.T)
-            )
-            known |= {tuple(row) for row in ids[np.asarray(pairs.closest(p, is_edge).distance) < pairs.GAP]}
+            place = columns((way + radius[:, None] * off).astype(np.float32))
+            distance = closest(place, jnp.asarray(ids.T), is_edge).distance
+            known |= {tuple(row) for row in ids[np.asarray(distance) < pairs.GAP]}
         count = int(rows.count)
         own = [tuple(row) for row in np.asarray(rows.ids).T[:count]]
         assert known
@@ -133,6 +143,6 @@ def test_the_search_finds_every_pair_that_comes_near_while_vertices_move():
 def test_rows_beyond_a_table_are_counted():
     meshes, start = sheet_in_ball()
     still = lists.Motion(columns(start), columns(0 * start), jnp.full(len(start), 0.02))
-    few, many = (lists.find_pairs(still, meshes, rows) for rows in (512, 65536))
+    few, many = (find_pairs(still, meshes, rows) for rows in (512, 65536))
     assert int(few.most) == int(many.most) > 512
     assert int(few.pairs.edges.count) == 512

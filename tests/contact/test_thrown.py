@@ -13,13 +13,16 @@ from eslr_jax.mesh.surface import prepare_surface
 SPEED = 13.0  # [m/s], 43 cm in a frame
 BALL, LIMB = 0.15, 0.05  # radii [m]
 PLACES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])  # of plane, ball and limb [m]
+ROD = np.array([6.0, 0.0, 0.0])  # [m]
 find = jax.jit(find_both_sides)
 
 
 @pytest.fixture(scope="module")
 def obstacles():
-    bodies = (plane(1.0, 9, 0.0), icosphere(2, BALL), capsule(LIMB, 0.6, around=16, rings=8))
-    return join_meshes(*((mesh[0] + place, mesh[1]) for mesh, place in zip(bodies, PLACES, strict=True)))
+    limb, rod = capsule(LIMB, 0.6, around=16, rings=8), capsule(0.01, 0.6, around=8, rings=30)
+    bodies = (plane(1.0, 9, 0.0), icosphere(2, BALL), limb, rod)
+    places = (*PLACES, ROD)
+    return join_meshes(*((mesh[0] + place, mesh[1]) for mesh, place in zip(bodies, places, strict=True)))
 
 
 def thrown_sheets(obstacles, *, above):
@@ -72,14 +75,14 @@ def test_cloth_that_is_not_thrown_has_the_contacts_it_had(obstacles):
             )
 
 
-def test_a_rod_on_the_way_is_met_and_one_beside_it_is_not():
+def test_a_rod_on_the_way_is_met_and_one_beside_it_is_not(obstacles):
     """A vertex that is near nothing at t, and behind the rod at t + 1."""
-    rod = capsule(0.01, 0.6, around=8, rings=30)
-    body, surface = surface_of(rod)
-    start = jnp.array([[0.0, 0.25, 0.0], [0.0, 0.25, 0.05], [0.0, 0.02, 0.25]])
-    end = start - jnp.array([[0.0, 0.45, 0.0], [0.0, 0.45, 0.0], [0.0, 0.0, 0.45]])
-    contacts, _ = find(start, body, body, surface, None, end)
-    np.testing.assert_array_equal(contacts.is_near, [True, False, True])
+    body, surface = surface_of(obstacles)
+    start, way = np.full((300, 3), 9.0, np.float32), np.zeros((300, 3), np.float32)  # most near nothing
+    start[:3] = np.add(ROD, [[0.0, 0.25, 0.0], [0.0, 0.25, 0.05], [0.0, 0.02, 0.25]])
+    way[:3] = [[0.0, -0.45, 0.0], [0.0, -0.45, 0.0], [0.0, 0.0, -0.45]]
+    contacts, _ = find(jnp.asarray(start), body, body, surface, None, jnp.asarray(start + way))
+    np.testing.assert_array_equal(contacts.is_near[:3], [True, False, True])
     np.testing.assert_allclose(contacts.normals[0], [0.0, 1.0, 0.0], atol=0.1)
     assert float(contacts.normals[2, 1]) > 0.5  # over the rod, not at its side
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_sheet
 from paper.hood_metrics import hood_metrics
 
 from eslr_jax import prepare_garment
@@ -18,23 +19,14 @@ TIMESTEP = 1 / 30
 FRAMES = 4
 
 
-def sheet(count, spacing):
-    """Return a flat square sheet that faces up."""
-    x, z = np.meshgrid(np.arange(count) * spacing, np.arange(count) * spacing)
-    index = np.arange(count * count).reshape(count, count)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    positions = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
-    return positions, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
-
-
 @pytest.fixture(scope="module")
 def worn():
     """A crumpled sheet that slides over a floor which moves too: its positions and its scene."""
     random = np.random.default_rng(0)
-    rest, faces = sheet(5, 0.05)
+    rest, faces = make_sheet(5, 5, 0.05, jitter=0)
     ones = np.ones((len(rest), 1))
     garment = prepare_garment(rest, faces, skin_weights=ones, skin_indices=np.zeros_like(ones, int))
-    floor, floor_faces = sheet(7, 0.06)
+    floor, floor_faces = make_sheet(7, 7, 0.06, jitter=0)
     surface = prepare_surface(floor, floor_faces)
     floor = floor[np.asarray(surface.vertex_ids)] - [0.05, 0.0005, 0.05]
     steps = np.arange(FRAMES)[:, None, None]

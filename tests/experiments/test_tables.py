@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import eslr_here
 from paper import rollouts
 from paper.rollouts import Setting, read_system
 from paper.tables import (
@@ -25,7 +26,6 @@ from paper.tables import (
 )
 
 from eslr_jax import NonFiniteError, Status
-from eslr_jax.pipeline.assets.catalog import asset_names
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")
 ROW = {"stretch": 0.1, "gap_share": 0.1}
@@ -111,7 +111,9 @@ def test_controls_of_weights_show_no_training_cost():
 
 
 def test_default_rows_have_every_bundled_network_of_five_layers():
-    bundled = {name for name in asset_names("model") if name.endswith("-5-correction")}
+    models = json.loads(eslr_here("assets", "--kind", "model", "--json").stdout)
+    bundled = {model["name"] for model in models if model["name"].endswith("-5-correction")}
+    assert bundled
     networks = {name for row in DEEP for name in row.split("=")[1].split(",")}
     assert bundled <= networks
     assert all(Path(file).is_file() for file in networks - bundled)

@@ -1,13 +1,19 @@
 """A format is one file, and this is one: the public functions and the command know it by its suffix."""
 
+import contextlib
+import os
 import sys
 
 import numpy as np
 import pytest
 
 from eslr_jax import AssetError, load_body, load_motion
+from eslr_jax.files.atomic import atomic_write, ensure_output_dir
+from eslr_jax.files.npz import read_arrays, write_arrays
+from eslr_jax.pipeline.assets.catalog import find_asset
 from eslr_jax.pipeline.cli import app
 from eslr_jax.pipeline.cli.runs import Export
+from eslr_jax.pipeline.formats.bundled import read_body, read_motion_archive
 from eslr_jax.pipeline.formats.garment import read_garment_source
 from eslr_jax.pipeline.formats.mesh import MeshFile, read_mesh_file
 from eslr_jax.pipeline.formats.mesh_sequence import MeshSequence, read_mesh_sequence
@@ -84,3 +90,73 @@ def test_fbx_is_refused_with_the_way_out(tmp_path, load):
     (tmp_path / "avatar.fbx").write_bytes(b"Kaydara FBX Binary  \0")
     with pytest.raises(AssetError, match=r"export it as glTF .*File > Export > glTF 2\.0"):
         load(tmp_path / "avatar.fbx")
+
+
+# --- the bundled formats of bodies and motions --------------------------------------------------------------
+
+CLIP = {
+    "joint_names": np.array(["a", "b"]),
+    "walk/rotations": np.random.default_rng(0).normal(size=(4, 2, 3)),
+    "walk/translations": np.random.default_rng(1).normal(size=(4, 3)),
+    "walk/fps": np.array(33.3),
+}
+
+
+def test_a_clip_comes_back_exactly(tmp_path):
+    write_arrays(tmp_path / "a.npz", CLIP)
+    clip = read_motion_archive(tmp_path / "a.npz")["walk"]
+    np.testing.assert_array_equal(clip.rotations, CLIP["walk/rotations"])
+    np.testing.assert_array_equal(clip.translations, CLIP["walk/translations"])
+    assert (clip.fps, clip.joint_names) == (33.3, ("a", "b"))
+
+
+def test_skin_weights_of_a_body_sum_to_one(tmp_path):
+    bundled = read_arrays(find_asset("body", "anny"), content="body")
+    write_arrays(tmp_path / "body.npz", {**bundled, "skin_weights": 0.97 * bundled["skin_weights"]})
+    np.testing.assert_allclose(
+        read_body(tmp_path / "body.npz").skin_weights, bundled["skin_weights"], atol=1e-6
+    )
+
+
+# --- files appear whole or not at all -----------------------------------------------------------------------
+
+
+def test_atomic_write_replaces_the_file_and_keeps_the_suffix(tmp_path):
+    target = tmp_path / "result.npz"
+    target.write_text("old")
+    with atomic_write(target) as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".npz"
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+    assert os.listdir(tmp_path) == ["result.npz"]
+
+
+def test_atomic_write_failure_leaves_everything_as_before(tmp_path):
+    target = tmp_path / "result.npz"
+    target.write_text("old")
+    with contextlib.suppress(KeyboardInterrupt), atomic_write(target) as temporary:
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["result.npz"]
+
+
+@pytest.mark.parametrize("place", ["", "missing/file", "file"])
+def test_atomic_write_names_an_impossible_target_and_a_block_that_wrote_nothing(tmp_path, place):
+    with pytest.raises(AssetError, match="can't write"), atomic_write(tmp_path / place):
+        pass
+
+
+def test_ensure_output_dir_creates_parents_and_leaves_them_empty(tmp_path):
+    folder = ensure_output_dir(tmp_path / "a" / "b")
+    assert folder.is_dir()
+    assert not os.listdir(folder)
+
+
+@pytest.mark.parametrize("name", ["file", "file/below"])
+def test_ensure_output_dir_names_a_file_in_the_way(tmp_path, name):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(AssetError, match="output folder"):
+        ensure_output_dir(tmp_path / name)

@@ -13,6 +13,7 @@ from eslr_jax.pipeline.formats.palette import SKIN_COLOR
 from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_trajectory, write_run
 from eslr_jax.pose.motion import still_motion
+from eslr_jax.terms import CLOTH
 
 RNG = np.random.default_rng(0)
 FRAMES = 3
@@ -109,7 +110,7 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
     """What an earlier run left in the folder stays then, so that no report is of another trajectory."""
     garment, rig = load_garment_file("tshirt"), body
     poses = pose_body(rig, still_motion(rig, 3))
-    scene = prepare_scene(prepare_stored(garment), poses)
+    scene = prepare_scene(prepare_stored(garment), poses, terms=CLOTH)
     moved = np.repeat(np.asarray(scene.initial_state.position)[None], 3, axis=0)
     residuals = np.arange(len(moved), dtype=np.float32)
     track = ClothTrack(moved, np.zeros_like(moved), np.zeros(moved.shape[:2]), residuals)

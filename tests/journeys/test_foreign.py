@@ -146,20 +146,9 @@ def test_a_skirt_flies_in_the_wind_and_its_gap_is_that_of_the_windy_frames(eslr,
 
 def test_a_run_without_ground_falls_below_the_feet(fallen, eslr, tmp_path):
     folder, _, _ = fallen
-    words = (
-        "--simulator",
-        "physics",
-        "--iterations",
-        20,
-        "--frames",
-        61,
-        "--settle",
-        0,
-        "--no-pictures",
-        "--json",
-    )
+    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--settle", 0, "--json")
     garment = ("--garment", folder.parent / "skirt.npz", "--ground", "off")
-    result = eslr("simulate", *garment, *words, "--out", tmp_path)
+    result = eslr("simulate", *garment, *words, "--no-pictures", "--out", tmp_path)
     report = json.loads(result.stdout)
     assert report["ground_m"] is None
     with np.load(tmp_path / "trajectory.npz") as arrays:

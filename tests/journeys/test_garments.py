@@ -111,29 +111,6 @@ def test_a_garment_modelled_on_the_exported_body_fits_exactly(tmp_path, eslr, bo
     assert fitted.metadata["fit"]["penetration"]["before"]["inside"] == 0
 
 
-def test_a_shirt_and_shorts_in_one_file_are_held_at_the_waist_only(tmp_path, body):
-    shirt = bundled("tshirt_1k")
-    floor = float(np.asarray(body.rest_positions)[:, 1].min())
-    positions, faces = shorts()
-    both = (
-        np.concatenate([shirt.rest_positions - [0, floor, 0], positions]),
-        np.concatenate([shirt.faces, faces + len(shirt.rest_positions)]),
-    )
-    fitted = load(write_obj(tmp_path / "outfit.obj", both), body)
-    assert fitted.metadata["fit"]["mesh"]["components"] == 2
-    assert fitted.is_pinned.sum() == 100
-    assert not fitted.is_pinned[: len(shirt.rest_positions)].any()
-
-
-def test_shorts_turned_inside_out_and_without_a_pin(tmp_path, body):
-    positions, faces = shorts()
-    path = write_obj(tmp_path / "shorts.obj", (positions, faces[:, ::-1]))
-    fitted = load(path, body, pin=("none",))
-    np.testing.assert_array_equal(fitted.faces, faces)
-    assert not fitted.is_pinned.any()
-    assert "nothing holds the garment up" in fitted.metadata["fit"]["warnings"][0]
-
-
 def test_quads_become_triangles_and_keep_their_waist(tmp_path, body):
     positions, faces = skirt()
     quads = faces.reshape(2, -1, 3).transpose(1, 0, 2)  # two triangles of every cell of the grid

@@ -1,7 +1,6 @@
 """Ctrl-C at several moments: `simulate` and `train` lose little, and go on to the same result."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -9,9 +8,6 @@ import time
 from functools import partial
 
 import numpy as np
-import pytest
-
-from eslr_jax.simulation.interrupt import Interruption
 
 SIMULATE = ("--simulator", "physics", "--iterations", 150, "--frames", 141, "--settle", 5, "--no-pictures")
 RECIPE = """
@@ -136,20 +132,3 @@ def test_a_training_stops_at_once_while_it_compiles_and_resumes(tmp_path, eslr, 
     with np.load(whole / "model.npz") as ours, np.load(part / "model.npz") as theirs:
         for name in ours.files:
             np.testing.assert_array_equal(ours[name], theirs[name])
-
-
-def test_a_second_signal_acts_at_once_whatever_begins_meanwhile():
-    heard = []
-
-    def press():
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(1.0)
-
-    with Interruption(lambda: heard.append("first")) as stop:
-        stop.begin()
-        press()
-        assert stop.is_wanted
-        stop.begin()  # as after every chunk of frames
-        with pytest.raises(KeyboardInterrupt):
-            press()
-    assert heard == ["first"]

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from eslr_jax import ConfigError
+from eslr_jax.mesh.closest import closest_points
+from eslr_jax.mesh.embedding import geodesic_embedding
 from eslr_jax.mesh.geodesic import (
     farthest_point_landmarks,
     geodesic_distances,
@@ -10,6 +13,7 @@ from eslr_jax.mesh.geodesic import (
     unfolded_shortcuts,
 )
 from eslr_jax.mesh.topology import unique_edges
+from eslr_jax.pipeline.assets import asset_names, load_garment_file
 
 
 def relative_errors(positions, faces, num_sources=5):
@@ -86,3 +90,111 @@ def test_components_are_bridged_at_their_nearest_vertices(builders):
     distances = geodesic_distances(graph, np.arange(27))
     assert np.isfinite(distances).all()
     np.testing.assert_allclose(distances[0, 9 + 2], 0.9)  # straight through the corners of all three
+
+
+# --- what an embedding must keep: geodesic distances, and its coordinates under renumbering and remeshing
+
+MODES = ["raw", "canonical", "landmarks"]
+
+
+def stress(positions, faces, embedding):
+    """Kruskal's stress-1 over pairs with 100 random vertices."""
+    sources = np.random.default_rng(1).integers(0, len(positions), 100)
+    target = geodesic_distances(geodesic_graph(positions, faces), sources)
+    found = np.linalg.norm(embedding[sources][:, None] - embedding[None], axis=-1)
+    return np.sqrt(np.sum((found - target) ** 2) / np.sum(target**2))
+
+
+def mismatch(fine, coarse, **options):
+    """Distance between the embeddings of two meshes at equal points over the embedding's size, both RMS."""
+    embedding = geodesic_embedding(*fine, **options)
+    other = geodesic_embedding(*coarse, **options)
+    face, barycentric = closest_points(fine[0], *coarse)
+    matched = np.einsum("vc,vce->ve", barycentric, other[coarse[1][face]])
+    size = np.sqrt(np.sum((embedding - embedding.mean(axis=0)) ** 2, axis=1).mean())
+    return np.sqrt(np.sum((embedding - matched) ** 2, axis=1).mean()) / size
+
+
+def load(name, vertices):
+    garment = load_garment_file(name, vertices=vertices)
+    return garment.rest_positions, garment.faces
+
+
+@pytest.mark.parametrize("mode", ["raw", "canonical"])
+def test_stress_on_a_tube(builders, mode):
+    tube = builders.tube(32, 32)
+    assert stress(*tube, geodesic_embedding(*tube, size=8, mode=mode)) <= 0.08
+
+
+def test_flat_sheet_embeds_isometrically(builders):
+    sheet = builders.sheet(12, 12, jitter=0.02)
+    sheet[0][:, 2] = 0
+    assert stress(*sheet, geodesic_embedding(*sheet, size=8)) < 0.02
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_renumbering_vertices_permutes_rows(builders, mode):
+    positions, faces = builders.tube(20, 15, flare=0.2, depth=0.8, twist=0.3)
+    permuted, permuted_faces, old = builders.permute(positions, faces)
+    embedding = geodesic_embedding(positions, faces, mode=mode)
+    again = geodesic_embedding(permuted, permuted_faces, mode=mode)
+    # ties between equally far landmarks may be broken otherwise; nothing else may change
+    np.testing.assert_allclose(again, embedding[old], atol=0.02 * np.abs(embedding).max())
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])  # rounding alone turns the axes of `raw`
+def test_translation_changes_nothing(builders, mode):
+    positions, faces = builders.tube(20, 15, depth=0.8)
+    moved = geodesic_embedding(positions + np.array([0.1, 1.0, -0.3]), faces, mode=mode)
+    embedding = geodesic_embedding(positions, faces, mode=mode)
+    np.testing.assert_allclose(moved, embedding, atol=0.02 * np.abs(embedding).max())  # ties, as above
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_two_meshes_of_a_tube_agree(builders, mode):
+    fine = builders.tube(48, 40, flare=0.2, depth=0.8, twist=1.0)
+    coarse = builders.tube(28, 22, flare=0.2, depth=0.8)
+    assert mismatch(fine, coarse, mode=mode) <= 0.08
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_two_meshes_of_every_garment_agree(mode):
+    for name in {name.rsplit("_", 1)[0] for name in asset_names("garment")}:
+        assert mismatch(load(name, "4k"), load(name, "1k"), mode=mode) <= 0.08, name
+
+
+def test_canonical_axes_follow_the_rest_pose(builders):
+    positions, faces = builders.tube(24, 20, flare=0.2, depth=0.8)
+    embedding = geodesic_embedding(positions, faces)
+    for axis in range(3):
+        assert np.corrcoef(embedding[:, axis], positions[:, axis])[0, 1] > 0.95
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [2, 8, 16])
+def test_any_size_on_a_tiny_mesh(builders, mode, size):
+    embedding = geodesic_embedding(*builders.octahedron(), size=size, mode=mode)
+    assert embedding.shape == (6, size)
+    assert embedding.dtype == np.float64
+    assert np.isfinite(embedding).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_components_get_finite_coordinates(builders, mode):
+    positions, faces = builders.sheet(6, 6)
+    both = np.concatenate([positions, positions + np.array([0.0, 0.0, 0.3])])
+    embedding = geodesic_embedding(both, np.concatenate([faces, faces + 36]), mode=mode)
+    assert np.isfinite(embedding).all()
+
+
+def test_landmark_coordinates_fall_with_the_distance_to_a_corner(builders):
+    positions, faces = builders.sheet(6, 8)
+    nearest_corner = geodesic_embedding(positions, faces, mode="landmarks")[:, 0]
+    distances = np.linalg.norm(positions - positions.min(axis=0), axis=1)
+    np.testing.assert_allclose(nearest_corner, 0.4 * np.exp(-distances / 0.4), rtol=0.03)  # Dijkstra's error
+
+
+def test_unknown_mode_is_named(builders):
+    with pytest.raises(ConfigError, match="'polar' is unknown; use one of raw, canonical, landmarks"):
+        geodesic_embedding(*builders.tube(), mode="polar")

@@ -2,8 +2,14 @@
 
 import numpy as np
 import pytest
+import trimesh
+from cloth import make_sheet
+from reference_models import make_scene
 
 from eslr_jax.mesh import topology
+from eslr_jax.mesh.coarse import add_coarse_edges, coarsen
+from eslr_jax.mesh.topology import face_areas, unique_edges
+from eslr_jax.pipeline.dressing.remesh import refine
 
 
 def sides(faces):
@@ -122,3 +128,82 @@ def test_components_are_counted(builders):
     count, labels = topology.vertex_components(np.concatenate([faces, faces + 9]), 18)
     assert count == 2
     assert len(set(labels[:9])) == len(set(labels[9:])) == 1
+
+
+# --- refined meshes: still a manifold with the same boundary, on the same surface ---------------------------
+
+
+@pytest.mark.parametrize("scheme", ["t", "q", "tq"])
+def test_a_refined_sheet_is_flat_and_covers_the_same_area(scheme):
+    positions, faces = make_sheet(7, 9, 0.1, jitter=0)
+    finer = refine(faces, len(positions), scheme)
+    points = finer.smooth @ positions
+    assert len(finer.faces) == len(finer.parents)
+    growth = {"t": 3, "q": 4}
+    assert len(finer.faces) == len(faces) * np.prod([growth[letter] for letter in scheme])
+    sides = np.sort(np.concatenate([finer.faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
+    directed = np.concatenate([finer.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    assert len(np.unique(directed, axis=0)) == len(directed), "all faces turn the same way"
+    assert len(points) - len(unique_edges(finer.faces)) + len(finer.faces) == 1
+    np.testing.assert_allclose(points[:, 1], positions[0, 1], atol=1e-12)
+    area = face_areas(points, finer.faces)
+    assert (area > 0).all()
+    # Corners of the boundary are rounded, by less than a coarse face.
+    np.testing.assert_allclose(area.sum(), face_areas(positions, faces).sum(), atol=0.006)
+
+
+def test_a_refined_ball_stays_round_and_attributes_are_interpolated():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    finer = refine(ball.faces, len(ball.vertices), "tq")
+    radius = np.linalg.norm(finer.smooth @ ball.vertices, axis=1)
+    assert np.ptp(radius) < 0.01
+    for matrix in (finer.smooth, finer.linear):
+        np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-12)
+    old = finer.linear[: len(ball.vertices)]
+    np.testing.assert_array_equal(old.toarray(), np.eye(len(ball.vertices)))
+    centroid, coarse = (finer.linear @ ball.vertices)[finer.faces].mean(axis=1), ball.triangles_center
+    assert np.linalg.norm(centroid - coarse[finer.parents], axis=1).max() < 0.35, "near its parent"
+
+
+# --- coarse levels of small graphs whose levels can be drawn by hand ----------------------------------------
+
+
+def path(count):
+    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+
+
+def test_every_level_of_a_path_keeps_every_other_vertex():
+    levels = coarsen(path(9), 9)  # the centre is vertex 4
+    np.testing.assert_array_equal(levels[0], [[0, 2], [2, 4], [4, 6], [6, 8]])
+    np.testing.assert_array_equal(levels[1], [[0, 4], [4, 8]])
+    assert len(levels[2]) == 0  # the ends are at one hop and have no farther neighbours
+
+
+def test_components_are_coarsened_alone():
+    both = np.concatenate([path(5), path(5) + 5])
+    level = coarsen(both, 10)[0]
+    np.testing.assert_array_equal(level, [[0, 2], [2, 4], [5, 7], [7, 9]])
+
+
+@pytest.mark.parametrize("count", [9, 10])
+def test_a_ring_is_closed_again(count):
+    """Opposite the centre of nine, two kept neighbours meet; of ten, one is removed between two kept ones."""
+    ring = np.concatenate([path(count), [[count - 1, 0]]])
+    level = coarsen(ring, count)[0]
+    np.testing.assert_array_equal(np.unique(level, return_counts=True)[1], [2, 2, 2, 2, 2])
+
+
+@pytest.mark.parametrize("pad", [False, True])
+def test_coarse_edges_are_directed_sorted_and_paired(pad):
+    garment = add_coarse_edges(make_scene(8, 6, pad=pad)[0])
+    kept = np.count_nonzero(garment.vertex_mask)
+    for level in garment.coarse:
+        assert (np.diff(level.receivers) >= 0).all()
+        np.testing.assert_array_equal(level.senders[level.reverse_edges], level.receivers)
+        np.testing.assert_array_equal(
+            np.flatnonzero(level.is_kept), np.unique(level.senders[level.edge_mask])
+        )
+        assert np.count_nonzero(level.is_kept) <= 0.6 * kept
+        kept = np.count_nonzero(level.is_kept)
+    assert bool(pad) == (not garment.coarse[0].edge_mask.all())

@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 import pytest
 
-from eslr_jax import prepare_scene
 from eslr_jax.pipeline.report.scene_parts import describe_scene, take_turns, time_parts
+from eslr_jax.simulation.scene import start_integrator
 from eslr_jax.terms import CLOTH, Air, Damping
 from eslr_jax.types import Threads
 
 
-def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene):
+def test_what_a_scene_lacks_is_left_out(small_poses, small_scene):
     parts = describe_scene(small_scene, small_poses, None)
     assert set(parts.modelled) == {
         "stretch", "bending", "inertia", "gravity", "collision", "friction", "contact", "body",
@@ -18,11 +18,12 @@ def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene)
         "pins", "ground", "air", "damping", "fabric by part", "network",
     }  # fmt: skip
     assert parts.modelled["stretch"] == "100 faces"
-    options = {"terms": (*CLOTH, Air((3.0, 0.0, 4.0)), Damping(0.01))}
-    bare = describe_scene(prepare_scene(small_garment, small_poses, **options), small_poses, None)
+    bare = small_scene.replace(terms=(*CLOTH, Air((3.0, 0.0, 4.0)), Damping(0.01)), body=None)
+    bare = describe_scene(bare, small_poses, None)
     assert bare.left_out["collision"] == "no body in reach"
     assert (bare.modelled["air"], bare.modelled["damping"]) == ("5.0 m/s", "0.01 s")
-    scene = prepare_scene(small_garment, small_poses, integrator="bdf2", substeps=2)
+    start = start_integrator(small_scene.initial_state, "bdf2")
+    scene = small_scene.replace(initial_state=start, substeps=2)
     threads = Threads(warp=jnp.ones((100, 2)), stiffness=jnp.ones((4, 100)))
     woven = scene.replace(material=scene.material.replace(threads=threads))
     parts = describe_scene(woven, small_poses, None)

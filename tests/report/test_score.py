@@ -88,8 +88,8 @@ def test_how_the_garment_sits_is_scored_with_the_whole_body(small_scene, small_p
     assert score["below_feet_at"] is None
 
 
-def test_what_is_no_trajectory_of_the_scene_is_refused(small_scene, small_trajectory):
-    positions = np.array(small_trajectory.positions)
+def test_what_is_no_trajectory_of_the_scene_is_refused(small_scene):
+    positions = np.repeat(np.array(small_scene.initial_state.position)[None], small_scene.num_frames, axis=0)
     with pytest.raises(MotionError, match="not those of the scene"):
         score_trajectory(positions[:-1], small_scene)
     with pytest.raises(ConfigError, match="1 or more"):
@@ -97,15 +97,6 @@ def test_what_is_no_trajectory_of_the_scene_is_refused(small_scene, small_trajec
     positions[4, 0] = np.nan
     with pytest.raises(NonFiniteError, match="frame 4"):
         score_trajectory(positions, small_scene)
-
-
-def test_a_trajectory_is_plain_arrays_by_name(tmp_path, small_trajectory):
-    arrays = small_trajectory.to_dict()
-    assert {type(array) for array in arrays.values()} == {np.ndarray}
-    np.testing.assert_array_equal(arrays["stretch_energy"], small_trajectory.energies["stretch"])
-    np.testing.assert_array_equal(arrays["positions"], small_trajectory.positions)
-    assert "terms" not in arrays
-    np.savez(tmp_path / "a.npz", **arrays)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax import AssetError, MeshError, MotionError, load_motion, pose_body
 from eslr_jax.pipeline.assets.motions import read_joint_map
+from eslr_jax.pipeline.rigs.clothing import body_pieces
 from eslr_jax.pipeline.rigs.procedural import PROCEDURAL
 from eslr_jax.pipeline.rigs.rig import body_skeleton, hips_first, make_body, make_motion, skeleton_motion
 from eslr_jax.pose.joints import find_named_parts, find_parts, map_joints, torso_axes
@@ -370,3 +371,48 @@ def test_a_body_in_float64_has_the_same_search_tables(body):
         rest_positions=np.asarray(body.rest_positions, np.float64), faces=np.asarray(body.faces, np.int64)
     )
     jax.tree.map(np.testing.assert_array_equal, obstacle_surface(body), obstacle_surface(double))
+
+
+# --- what a body wears in pictures --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pieces(body):
+    positions, faces = np.asarray(body.rest_positions), np.asarray(body.faces)
+    return {piece.name: piece for piece in body_pieces(positions, faces, body)}
+
+
+def area(points, faces):
+    corners = points[faces]
+    return (
+        0.5
+        * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    )
+
+
+def test_pieces_are_the_body_s_surface(body, pieces):
+    positions, faces = np.asarray(body.rest_positions, np.float64), np.asarray(body.faces)
+    assert set(pieces) == {"skin", "top", "shorts"}
+    total = sum(area(piece.place(positions).astype(float), piece.faces) for piece in pieces.values())
+    assert total == pytest.approx(area(positions, faces), rel=1e-4)
+    sides = {name: area(piece.place(positions), piece.faces) / total for name, piece in pieces.items()}
+    assert 0.1 < sides["top"] < 0.35
+    assert 0.1 < sides["shorts"] < 0.3
+
+
+def test_head_hands_and_feet_are_bare(body, pieces):
+    positions = np.asarray(body.rest_positions)
+    joints = {name: np.asarray(body.joint_rest_positions)[k] for k, name in enumerate(body.joint_names)}
+    top, shorts = (pieces[name].place(positions) for name in ("top", "shorts"))
+    assert top[:, 1].max() < joints["Head"][1]
+    assert abs(top[:, 0]).max() < joints["LeftForeArm"][0]
+    assert top[:, 1].min() == pytest.approx(shorts[:, 1].max(), abs=1e-5)  # they meet at the waist
+    assert shorts[:, 1].min() > joints["LeftLeg"][1]  # over the knees
+    assert abs(shorts[:, 0]).max() < joints["LeftForeArm"][0]
+
+
+def test_a_body_of_unknown_joints_is_all_skin(body):
+    unknown = body.replace(joint_names=tuple(f"bone{k}" for k in range(len(body.joint_names))))
+    (piece,) = body_pieces(np.asarray(body.rest_positions), np.asarray(body.faces), unknown)
+    assert piece.name == "skin"
+    np.testing.assert_array_equal(piece.place(body.rest_positions), np.asarray(body.rest_positions))

@@ -28,7 +28,7 @@ from eslr_jax.mesh.rest_shape import with_rest_positions
 from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_scenes, stack_scenes
 from eslr_jax.simulation.plan import shared_surface
 from eslr_jax.simulation.simulate import raise_for_status
-from eslr_jax.terms import CLOTH, Damping, Ground
+from eslr_jax.terms import CLOTH, FAST, Damping, Ground
 
 QUICK = SimConfig(iterations=5)
 CLIPS = (
@@ -50,7 +50,7 @@ def poses():
 
 @pytest.fixture(scope="module")
 def batch(garments, poses):
-    return simulate_batch(None, garments, [poses] * 3, config=QUICK, material=FABRICS)
+    return simulate_batch(None, garments, [poses] * 3, config=QUICK, material=FABRICS, terms=FAST)
 
 
 def test_a_batch_equals_one_by_one_with_its_own_vertices(batch, garments, poses):
@@ -59,7 +59,7 @@ def test_a_batch_equals_one_by_one_with_its_own_vertices(batch, garments, poses)
     for trajectory in batch:
         raise_for_status(trajectory)
     padded = 1
-    scene = prepare_scene(garments[padded], poses, material=FABRICS[padded], surface=surface)
+    scene = prepare_scene(garments[padded], poses, material=FABRICS[padded], terms=FAST, surface=surface)
     alone = rollout_scene(None, scene, QUICK)
     assert batch[padded].positions.shape == alone.positions.shape
     np.testing.assert_allclose(batch[padded].positions, alone.positions, atol=1e-5)
@@ -111,7 +111,7 @@ def test_three_bundled_garments_on_eight_motions_equal_one_by_one():
 def test_another_motion_compiles_nothing_anew(batch, garments, poses):
     before = rollout_scenes._cache_size()
     moved = poses.replace(positions=poses.positions + 0.01)
-    again = simulate_batch(None, garments, [moved] * 3, config=QUICK, material=FABRICS)
+    again = simulate_batch(None, garments, [moved] * 3, config=QUICK, material=FABRICS, terms=FAST)
     assert rollout_scenes._cache_size() == before
     assert not np.array_equal(again[1].positions, batch[1].positions)
 
@@ -164,7 +164,7 @@ def test_all_that_a_scene_can_model_maps_over_scenes(poses):
 
 
 def test_unlike_scenes_are_not_stacked(garments, poses):
-    scene = prepare_scene(garments[0], poses)
+    scene = prepare_scene(garments[0], poses, terms=FAST)
     bare = prepare_scene(garments[0], poses, terms=CLOTH)
     with pytest.raises(ValueError, match="differ in what they model"):
         stack_scenes([scene, bare])

@@ -4,14 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from draped_ball import drifting_ball, square
 from jax import export
 from own_term import Push
 
-from eslr_jax import SimConfig
+from eslr_jax import SimConfig, prepare_scene, scene_terms
 from eslr_jax.numerics import masked_sum
-from eslr_jax.simulation import program
+from eslr_jax.simulation import frame, program
 from eslr_jax.simulation.program import find_program
-from eslr_jax.terms import Friction
+from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.terms import Air, Damping, Friction, Ground
 
 VALUES = (jnp.arange(5.0), jnp.arange(5) > 1)
 
@@ -103,3 +105,30 @@ def test_functions_of_one_name_are_told_apart(folder, monkeypatch):
 )
 def test_only_code_of_the_package_is_kept(part, is_known):
     assert program._is_known(part) == is_known
+
+
+# --- a frame's program multiplies in full precision ---------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_physics_multiplies_in_full_precision():
+    """A GPU rounds the operands of other products of float32 to ten bits."""
+    options = {
+        "terms": scene_terms(
+            Ground(is_always=True),
+            Air((0.0, 0.0, 0.0)),
+            Damping(0.01),
+        ),
+        "integrator": "bdf2",
+    }
+    scene = prepare_scene(square(), drifting_ball(13), **options)
+    stepper = make_stepper(None, SimConfig(iterations=5))
+    inputs = jax.tree.map(lambda leaf: leaf[0], frame.frame_inputs(scene))
+
+    def step(scene, state, inputs):
+        return stepper(frame.frame_problem(scene, state, inputs), state)
+
+    program = jax.jit(step).lower(scene, scene.initial_state, inputs).as_text()
+    products = [line for line in program.splitlines() if "stablehlo.dot_general" in line]
+    assert products
+    assert not [line for line in products if "HIGHEST" not in line]

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cloth import make_garment, make_sheet
+from jax import numpy as jnp
 
 from eslr_jax import ConfigError, Material, scene_terms
-from eslr_jax.fabric.materials import COTTON
+from eslr_jax.fabric.materials import COTTON, fabric_material
 from eslr_jax.fabric.validate import MATERIAL_RANGES, validate_material, validate_timestep
+from eslr_jax.networks.features import LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.terms import Air, Collision, Damping, Gravity
+from eslr_jax.terms.stretch import contact_excess
 
 TERMS = (*scene_terms(), Air((0.0, 0.0, 0.0)), Damping(0.01))
 CONSTANTS = [(term, field) for term in TERMS for field in term.ranges]
@@ -101,3 +104,20 @@ def test_the_validator_is_light_to_import():
 
     code = "import sys, eslr_jax.fabric.validate; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- contacts that suit the fabric --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_fabrics_that_networks_know_have_the_constants_they_were_trained_with(end):
+    material = COTTON.replace(lame_mu=LAME_MU_RANGE[end], lame_lambda=LAME_LAMBDA_RANGE[end])
+    assert float(contact_excess(material)) == 1.0
+
+
+def test_contacts_grow_with_the_stiffest_face():
+    one, double = (contact_excess(fabric_material("suiting").replace(thickness=h)) for h in (4.7e-4, 9.4e-4))
+    assert one > 40
+    assert double == pytest.approx(2 * float(one))
+    mixed = COTTON.replace(lame_mu=jnp.array([23600.0, 1e7, 23600.0]))
+    assert contact_excess(mixed) == contact_excess(COTTON.replace(lame_mu=1e7))

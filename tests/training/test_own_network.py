@@ -19,8 +19,6 @@ CODE = """
 from flax import linen as nn
 from eslr_jax.networks.network import System, network
 from eslr_jax.solver.guess import initial_guess
-from eslr_jax.solver.potential import evaluate
-from eslr_jax.terms.problem import weight_norm
 
 @network("nudge")
 class Nudge(nn.Module, System):
@@ -28,9 +26,8 @@ class Nudge(nn.Module, System):
 
     @nn.compact
     def __call__(self, problem, state):
-        guess = initial_guess(problem).position
-        rows = nn.relu(nn.Dense(self.width)(evaluate(guess, problem).gradient / weight_norm(problem)))
-        return guess + 1e-3 * nn.Dense(3)(rows)
+        rows = nn.relu(nn.Dense(self.width)(state.velocity))
+        return initial_guess(problem).position + 1e-3 * nn.Dense(3)(rows)
 """
 
 
