@@ -21,7 +21,7 @@ from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
 from eslr_jax.simulation.scene import initial_state, slice_tracks
 from eslr_jax.simulation.stepper import make_stepper, past_state
-from eslr_jax.types import FAR, ClothState, Obstacle, Scene, Trajectory
+from eslr_jax.types import FAR, ClothState, Scene, Trajectory
 
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
@@ -232,7 +232,9 @@ def _share_programs(scene: Scene) -> Scene:
         return scene
     surface, positions = pad_surface(body.surface), np.asarray(body.positions)
     added = ((0, 0), (0, len(surface.vertex_ids) - positions.shape[1]), (0, 0))
-    return scene.replace(body=Obstacle(surface, np.pad(positions, added, constant_values=FAR)))
+    return scene.replace(
+        body=body.replace(surface=surface, positions=np.pad(positions, added, constant_values=FAR))
+    )
 
 
 def _chunk_of(scene: Scene) -> int:
