@@ -23,9 +23,8 @@ class MeshTables(NamedTuple):
     senders: Int[Array, " edges"]
     receivers: Int[Array, " edges"]  # ascending
     reverse_edges: Int[Array, " edges"]  # index of the opposite edge
-    neighbors: Int[
-        Array, "vertices degree"
-    ]  # senders of the incoming edges, padded with the number of vertices
+    # Senders of the incoming edges, padded with the number of vertices.
+    neighbors: Int[Array, "vertices degree"]
     degree: Float[Array, "vertices 1"]  # number of neighbours
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from eslr_jax.errors import AssetError
 from eslr_jax.networks.network import Network
-from eslr_jax.networks.weights import read_network
+from eslr_jax.networks.registry import read_network
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
 
 DEFAULT_MODEL = "eslr-small"  # of `eslr simulate --simulator network`
