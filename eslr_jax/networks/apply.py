@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Bool, Float
 
+from eslr_jax.contact.nearest import find_near_vertices
 from eslr_jax.networks import build, features, normalizer
 from eslr_jax.networks.features import GraphInputs, RefinementInputs
 from eslr_jax.networks.network import Network, Prediction, Statistics
@@ -112,19 +113,23 @@ def merge_statistics(network: Network, measured: Statistics) -> Network:
     return network.replace(statistics={**seen, **merged})
 
 
-def graph_inputs(problem: FrameProblem, state: ClothState) -> GraphInputs:
-    """Return what a graph is built from; pinned vertices already carry their next target (HOOD)."""
+def graph_inputs(problem: FrameProblem, state: ClothState, kind: build.GraphKind) -> GraphInputs:
+    """Return what a graph of a kind is built from; pinned vertices already carry their next target (HOOD)."""
     position = pin(problem, state.position)
     velocity = state.velocity * problem.timestep
     if problem.pin_targets is not None:
         is_pinned = problem.garment.is_pinned[:, None]
         velocity = jnp.where(is_pinned, position - state.position, velocity)
-    touched = problem.data_of(Collision)
+    touched, body, others = problem.data_of(Collision), problem.body, kind.world_edges - 1
+    contacts = None if touched is None else touched.nearest
+    if contacts is not None and body is not None and others:
+        near = find_near_vertices(position, body.start, body.end, body.surface, others)
+        contacts = jax.tree.map(lambda *rows: jnp.concatenate(rows), contacts, near)
     return GraphInputs(
         position=position,
         velocity=velocity,
         timestep=problem.timestep,
-        contacts=None if touched is None else touched.nearest,
+        contacts=contacts,
         inertial_guess=problem.inertial_guess,
         weight=problem.gravity * problem.masses,
     )
@@ -135,7 +140,7 @@ def predict_acceleration(network: Network, problem: FrameProblem, state: ClothSt
 
     Source: the paper's method section, Q' = Q + A dt and X' = X + Q' dt, in HOOD's per-frame units.
     """
-    inputs = graph_inputs(problem, state)
+    inputs = graph_inputs(problem, state, network.config.graph)
     graph = build.build_graph(problem.garment, problem.material, inputs, network.config.graph)
     output = apply_model(network, graph, problem.garment)
     velocity = inputs.velocity + scale_output(network, output)
@@ -157,7 +162,7 @@ def refine(network: Network, problem: FrameProblem, state: ClothState, *, detach
             trained to do its best from where it begins.
     """
     garment, material, config = problem.garment, problem.material, network.config
-    inputs = graph_inputs(problem, state)
+    inputs = graph_inputs(problem, state, config.graph)
     graph = build.build_frame_graph(garment, material, inputs, config.graph)
     guess = initial_guess(problem)
     encoded = encode_frame(network, graph)

@@ -255,8 +255,8 @@ def stack(module: type[nn.Module], config: Architecture, length: int, **attribut
     return scanned(config, **attributes)
 
 
-def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "vertices 1"]:
-    """Return one for every vertex with a world edge, zero for the others; zeros without a body."""
+def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "world_edges 1"]:
+    """Return one for every world edge within reach, zero for the others; zeros without a body."""
     rows = graph.nodes["garment"].shape[0]
     mask = cast(Topology, graph.globals).get("world_mask", jnp.zeros(rows, bool))
     return mask.astype(dtype)[:, None]

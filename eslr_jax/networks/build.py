@@ -2,15 +2,16 @@
 
 Nodes, edges, senders and receivers are dictionaries:
 
-- nodes "garment" [vertices, features] and, beside a body, "body" [vertices, features];
+- nodes "garment" [vertices, features] and, beside a body, "body" [world_edges, features];
 - edges "mesh" [edges, features] in both directions, sorted by receiver;
 - with `GraphKind.has_coarse_edges`, edges "coarse0" to "coarse2" [coarse_edges, features] of the coarse levels;
-- beside a body, edges "world" [vertices, features] from body to garment, and with
-  `GraphKind.has_reverse_edges` "world_reverse" [vertices, features] from garment to body.
+- beside a body, edges "world" [world_edges, features] from body to garment, and with
+  `GraphKind.has_reverse_edges` "world_reverse" [world_edges, features] from garment to body.
 
-A vertex has one world edge, to the nearest point of the body's surface: world edge v joins body row v to garment
-vertex v, so layers pair the rows and gather nothing. What lies beyond `GraphKind.world_edge_radius` has rows of
-zeros, and `globals["world_mask"]` leaves it out; with "state" a vertex inside the body keeps its edge.
+All vertices have as many world edges (`GraphKind.world_edges`). The first is to the nearest point of the body's
+surface, the others are to the nearest of its vertices. World edge w joins body row w to garment vertex w, modulo
+the vertices, so layers pair the rows and gather nothing. What lies beyond `GraphKind.world_edge_radius` has rows
+of zeros, and `globals["world_mask"]` leaves it out; with "state" a vertex inside the body keeps its first edge.
 Messages along mesh edges follow `senders["mesh"]`, `receivers["mesh"]` and the two tables in `globals` that
 go with them: `Topology` names all entries of `globals`.
 
@@ -30,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
 from eslr_jax.networks.features import GraphInputs, RefinementInputs
+from eslr_jax.networks.operators import to_world_edges
 from eslr_jax.numerics import safe_norm
 from eslr_jax.types import CoarseEdges, Garment, Material
 
@@ -49,6 +51,7 @@ class GraphKind(NamedTuple):
     has_coarse_edges: bool = False
     has_reverse_edges: bool = False  # from garment to body, for networks that update body rows
     world_edge_radius: float = 0.03  # [m] (HOOD)
+    world_edges: int = 1  # of a vertex, at most
 
 
 class Topology(TypedDict, total=False):
@@ -59,8 +62,8 @@ class Topology(TypedDict, total=False):
     coarse: tuple[CoarseEdges, ...]  # coarse levels, finest first; hierarchical networks
     edge_lengths: dict[str, Float[Array, ""]]  # mean at rest of every set [m]; features "gradient"
     garment_type: Int[Array, " vertices"]  # HOOD's vertex type; features "hood"
-    body_type: Int[Array, " vertices"]  # the same of the body rows
-    world_mask: Bool[Array, " vertices"]  # that are within reach
+    body_type: Int[Array, " world_edges"]  # the same of the body rows
+    world_mask: Bool[Array, " world_edges"]  # that are within reach
 
 
 def build_graph(
@@ -111,13 +114,14 @@ def build_frame_graph(
     senders = {name: level.senders for name, level in levels.items()}
     receivers = {name: level.receivers for name, level in levels.items()}
     if (contacts := inputs.contacts) is not None:
+        signed, count = contacts.distances, garment.vertex_mask.shape[0]
         if kind.reads_gradient:
-            away = jnp.abs(contacts.distances)
+            away = jnp.abs(signed)
         elif kind.reads_state:  # a vertex deep in the body needs its edge to the surface most
-            away = contacts.distances
+            away = jnp.abs(signed).at[:count].set(signed[:count])
         else:  # a contact of thrown cloth is measured on its path; HOOD's edges join what is near now
-            away = safe_norm(contacts.points - inputs.position)
-        mask = (away <= kind.world_edge_radius) & garment.vertex_mask
+            away = safe_norm(contacts.points - to_world_edges(inputs.position, signed.shape[0]))
+        mask = (away <= kind.world_edge_radius) & jnp.tile(garment.vertex_mask, kind.world_edges)
         topology["world_mask"] = mask
         if kind.reads_gradient:
             body = features.frame_body_features(contacts, inputs.timestep)
@@ -128,10 +132,10 @@ def build_frame_graph(
             world = features.hood_world_features(contacts, inputs, reads_state=kind.reads_state)
         nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
         senders["world"] = jnp.arange(mask.shape[0])
-        receivers["world"] = senders["world"]
+        receivers["world"] = senders["world"] % count
         if kind.has_reverse_edges:
             edges["world_reverse"] = features.reverse_world_features(edges["world"])
-            senders["world_reverse"] = receivers["world_reverse"] = senders["world"]
+            senders["world_reverse"], receivers["world_reverse"] = receivers["world"], senders["world"]
     return jraph.GraphsTuple(
         nodes=nodes,
         edges=edges,

@@ -183,8 +183,9 @@ class Eslr(TwoBranches):
 
     module_class = EncodeProcessDecode
     update_body: bool = False  # open: layers update body rows as HOOD does, see models.lsdmp
+    world_edges: int = 1  # of a vertex, at most: pairs within `world_edge_radius` (paper: all of them)
 
     @property
     def graph(self) -> GraphKind:
         """What the network reads of a frame."""
-        return super().graph._replace(has_reverse_edges=self.update_body)
+        return super().graph._replace(has_reverse_edges=self.update_body, world_edges=self.world_edges)

@@ -16,6 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.fabric.materials import COTTON
+from eslr_jax.networks.operators import to_world_edges
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
@@ -53,7 +54,8 @@ class GraphInputs:
 
     Lengths are in metres. Velocities are in metres per frame, the unit of HOOD's features. Pinned vertices
     already have their next target as `position`, and their way to it as `velocity`.
-    `contacts` is None in a scene without a body.
+    `contacts` is None in a scene without a body. It has a row per world edge, and all vertices have as many world
+    edges: all their first ones, then all their second ones.
     """
 
     position: Float[Array, "vertices 3"]  # [m]
@@ -168,7 +170,7 @@ def hood_garment_features(
     return jnp.column_stack([inputs.velocity, normals, timestep, mass, material_inputs(garment, material)])
 
 
-def hood_body_features(contacts: Contacts, timestep: Float[Array, ""]) -> Float[Array, "vertices 11"]:
+def hood_body_features(contacts: Contacts, timestep: Float[Array, ""]) -> Float[Array, "world_edges 11"]:
     """Return the columns of `hood_garment_features` for body points; mass and material are -1."""
     velocity = contacts.next_points - contacts.points
     unknown = -jnp.ones((velocity.shape[0], 4), velocity.dtype)
@@ -206,24 +208,24 @@ def hood_edge_features(
 
 def hood_world_features(
     contacts: Contacts, inputs: GraphInputs, *, reads_state: bool
-) -> Float[Array, "vertices features"]:
+) -> Float[Array, "world_edges features"]:
     """Return body point minus vertex 3 [m], its norm, the same with the body's next frame 4, timestep [s].
 
     As on mesh edges, that is sender minus receiver. With the state there are two signed distances behind them:
     from the body point now; from its next plane, of where velocity alone leads.
     """
-    position = inputs.position
+    position = to_world_edges(inputs.position, contacts.points.shape[0])
     timestep = jnp.broadcast_to(inputs.timestep, position.shape[:1])
     rows = [with_norm(contacts.points - position), with_norm(contacts.next_points - position), timestep]
     if reads_state:
-        later = plane_distance(position + inputs.velocity, contacts)
+        later = plane_distance(inputs.position + inputs.velocity, contacts)
         rows += [clip(distance / DISTANCE_SCALE) for distance in (contacts.distances, later)]
     return jnp.column_stack(rows)
 
 
 def reverse_world_features(
-    rows: Float[Array, "vertices features"],
-) -> Float[Array, "vertices features"]:
+    rows: Float[Array, "world_edges features"],
+) -> Float[Array, "world_edges features"]:
     """Return the features of the opposite world edges: the two leading (vector, norm) pairs change sign."""
     signs = jnp.ones(rows.shape[1], rows.dtype).at[jnp.array([0, 1, 2, 4, 5, 6])].set(-1)
     return rows * signs[None]
@@ -335,11 +337,12 @@ def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, " edges"]
     return clip(jnp.where(is_real, ratio - 1, 0) / STRAIN_SCALE)
 
 
-def frame_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "vertices 10"]:
+def frame_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 10"]:
     """Return the offset from the body point now 4 and at the next frame 4, with norms; signed distances 2."""
+    position = to_world_edges(inputs.position, contacts.points.shape[0])
     rows = [
-        with_norm(inputs.position - contacts.points) / BODY_OFFSET_SCALE,
-        with_norm(inputs.position - contacts.next_points) / BODY_OFFSET_SCALE,
+        with_norm(position - contacts.points) / BODY_OFFSET_SCALE,
+        with_norm(position - contacts.next_points) / BODY_OFFSET_SCALE,
         contacts.distances / DISTANCE_SCALE,
         plane_distance(inputs.inertial_guess, contacts) / DISTANCE_SCALE,
     ]
@@ -348,18 +351,19 @@ def frame_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array
 
 def refinement_world_features(
     guess: Float[Array, "vertices 3"], contacts: Contacts
-) -> Float[Array, "vertices 2"]:
+) -> Float[Array, "world_edges 2"]:
     """Return the guess's signed distance to the body's next tangent plane, coarse and in contact widths."""
     distance = plane_distance(guess, contacts)
     return clip(jnp.column_stack([distance / DISTANCE_SCALE, distance / CONTACT_SCALE]))
 
 
-def plane_distance(position: Float[Array, "vertices 3"], contacts: Contacts) -> Float[Array, " vertices"]:
-    """Return the signed distance [m] to the tangent plane at the body's next frame."""
+def plane_distance(position: Float[Array, "vertices 3"], contacts: Contacts) -> Float[Array, " world_edges"]:
+    """Return the signed distance [m] of an edge's vertex to the tangent plane at the body's next frame."""
+    position = to_world_edges(position, contacts.points.shape[0])
     return jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=1)
 
 
-def frame_body_features(contacts: Contacts, timestep: Float[Array, ""]) -> Float[Array, "vertices 10"]:
+def frame_body_features(contacts: Contacts, timestep: Float[Array, ""]) -> Float[Array, "world_edges 10"]:
     """Return the body point's velocity 3, its normal now 3 and at the next frame 3, and the timestep."""
     velocity = contacts.next_points - contacts.points
     column = jnp.broadcast_to(timestep_input(timestep), velocity.shape[:1])

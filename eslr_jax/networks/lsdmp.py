@@ -5,7 +5,7 @@ garment to body), f_e (`mesh_mlp`, `world_mlp`), f_v (`vertex_mlp`), f'_v (`smoo
 vertex i.
 
 The paper leaves open what follows; the choices are those of MeshGraphNet and HOOD. f_e, f_v and f'_v give
-increments, for edges and vertices alike. N(i) of eq. 3 includes the body point of i's world edge, and every
+increments, for edges and vertices alike. N(i) of eq. 3 includes the body points of i's world edges, and every
 smoothing adds e_ij again. One default differs from HOOD. HOOD updates its body vertices, and garment vertices
 near the same body vertex exchange messages through it. Here every world edge has a body row of its own, which
 could only return its garment vertex's own message. So body rows keep their encoding, and a layer costs a
@@ -30,18 +30,20 @@ from eslr_jax.networks.operators import (
     MeshTables,
     sum_neighbors,
     sum_receivers,
+    sum_world_edges,
     take_receivers,
     take_senders,
+    to_world_edges,
 )
 
 
 class WorldLatents(NamedTuple):
-    """Latents around the body. Row v belongs to garment vertex v."""
+    """Latents around the body. Row w belongs to garment vertex w, modulo the vertices."""
 
-    body: Float[Array, "vertices latent"]
-    edges: Float[Array, "vertices latent"]  # from body to garment
+    body: Float[Array, "world_edges latent"]
+    edges: Float[Array, "world_edges latent"]  # from body to garment
     # From garment to body; None where body rows are constant.
-    reverse: Float[Array, "vertices latent"] | None
+    reverse: Float[Array, "world_edges latent"] | None
 
 
 class Latents(NamedTuple):
@@ -58,7 +60,7 @@ class LayerTables(NamedTuple):
     """What is the same in every layer."""
 
     edges: dict[str, MeshTables]
-    world_mask: Float[Array, "vertices 1"]  # one where a vertex has a world edge; zeros without a body
+    world_mask: Float[Array, "world_edges 1"]  # one within reach; zeros without a body
 
 
 class LsdmpLayer(nn.Module):
@@ -128,12 +130,12 @@ def pass_messages(
         column += size
     if world is not None:
         mask, mlp = tables.world_mask, world_mlp
-        ends = mlp.start(garment, 0) + mlp.start(world.body, size)
+        ends = to_world_edges(mlp.start(garment, 0), mask.shape[0]) + mlp.start(world.body, size)
         to_garment = mask * mlp.finish(ends + mlp.start(world.edges, 2 * size, bias=True))
-        hidden = hidden + vertex_mlp.start(to_garment, column)
+        hidden = hidden + vertex_mlp.start(sum_world_edges(to_garment, garment.shape[0]), column)
         body, reverse = world.body, world.reverse
         if reverse is not None:
-            ends = mlp.start(body, 0) + mlp.start(garment, size)
+            ends = mlp.start(body, 0) + to_world_edges(mlp.start(garment, size), mask.shape[0])
             to_body = mask * mlp.finish(ends + mlp.start(reverse, 2 * size, bias=True))
             at_body = vertex_mlp.start(body, 0, bias=True) + vertex_mlp.start(to_body, column)
             body, reverse = body + vertex_mlp.finish(at_body), reverse + to_body
@@ -143,7 +145,7 @@ def pass_messages(
 
 def propagate(
     latents: Latents, tables: LayerTables, num_steps: int
-) -> tuple[Float[Array, "vertices latent"], Float[Array, "vertices latent"] | None]:
+) -> tuple[Float[Array, "vertices latent"], Float[Array, "world_edges latent"] | None]:
     """Smooth vertex latents: p_i = 1 / |N(i)| sum_(j in N(i)) (p_j + e_ij), `num_steps` times.
 
     The mean of e_ij is the same in every step and computed once. A vertex without neighbours keeps its latent. A
@@ -154,12 +156,12 @@ def propagate(
 
     Source: paper, eq. 3.
     """
-    garment, world, mesh = latents.garment, latents.world, tables.edges["mesh"]
-    degree, edge_sum = mesh.degree, cast(Array, latents.mesh_sum)
+    garment, world, mesh, mask = latents.garment, latents.world, tables.edges["mesh"], tables.world_mask
+    degree, edge_sum, count = mesh.degree, cast(Array, latents.mesh_sum), garment.shape[0]
     if world is not None:
-        degree = degree + tables.world_mask
+        degree = degree + sum_world_edges(mask, count)
         arriving = world.edges + world.body if world.reverse is None else world.edges
-        edge_sum = edge_sum + arriving * tables.world_mask
+        edge_sum = edge_sum + sum_world_edges(arriving * mask, count)
     inverse = jnp.where(degree > 0, 1 / jnp.maximum(degree, 1), 0)
     edge_mean = edge_sum * inverse
     body = None
@@ -169,7 +171,7 @@ def propagate(
     else:
         body = world.body
         for _ in range(num_steps):
-            total = sum_neighbors(garment, mesh) + body * tables.world_mask
-            body = garment + world.reverse
+            total = sum_neighbors(garment, mesh) + sum_world_edges(body * mask, count)
+            body = to_world_edges(garment, mask.shape[0]) + world.reverse
             garment = total * inverse + edge_mean
     return jnp.where(degree > 0, garment, latents.garment), body

@@ -84,8 +84,6 @@ def read_system(values: Any) -> System:
         raise ConfigError(f"the model is {values!r}; give a name or a table")
     given = {"base": values} if isinstance(values, str) else dict(values)
     name = given.pop("base", None)
-    if given.get("world_edges") == 1:  # in files from before 0.2; other numbers did not pay
-        del given["world_edges"]
     if not isinstance(name, str):
         raise ConfigError('the model has no base; add one, such as base = "eslr-small"')
     if name in MODELS:

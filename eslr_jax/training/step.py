@@ -283,7 +283,7 @@ def _frame(
     loss, report = physics_loss(network, problem, here.state, config, terms_of)
     statistics = {}
     if network.statistics:
-        inputs = graph_inputs(problem, here.state)
+        inputs = graph_inputs(problem, here.state, network.config.graph)
         graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
         acceleration = _skinned_acceleration(here, data, index)
         statistics = measure_statistics(network, graph, problem.garment, acceleration)

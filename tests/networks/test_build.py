@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from reference_models import make_scene, quick_jit, to_float64
 
+from eslr_jax.networks.apply import graph_inputs
 from eslr_jax.networks.build import GraphKind, build_graph, edge_set, feature_sizes, incoming_edges
 from eslr_jax.networks.features import mean_edge_length
+from eslr_jax.simulation.scene import initial_state
 
 HOOD = GraphKind(reads_gradient=False, has_reverse_edges=True)
 GRADIENT = GraphKind(reads_gradient=True)
@@ -129,11 +131,29 @@ def test_the_state_stands_beside_hoods_features(scene, hood_graph, state_graph):
         np.testing.assert_allclose(state_graph.edges[name][:, -2:], expected, atol=1e-4)
 
 
-def test_with_the_state_a_vertex_deep_in_the_body_keeps_its_world_edge(scene):
+def test_with_the_state_a_vertex_deep_in_the_body_keeps_its_first_world_edge(scene):
     garment, material, inputs = scene
     deep = inputs.contacts.replace(distances=jnp.full_like(inputs.contacts.distances, -0.2))
-    graph = build(STATE, (garment, material, inputs.replace(contacts=deep)))
-    assert np.asarray(graph.globals["world_mask"]).all()
+    twice = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), deep)
+    graph = build(STATE._replace(world_edges=2), (garment, material, inputs.replace(contacts=twice)))
+    first, second = np.asarray(graph.globals["world_mask"]).reshape(2, -1)
+    assert first.all()
+    assert not second.any()
+    np.testing.assert_array_equal(graph.receivers["world"][len(first) :], np.arange(len(first)))
+
+
+def test_the_other_world_edges_lead_to_the_nearest_body_vertices(small_problem):
+    problem, count = small_problem, small_problem.position.shape[0]
+    state = initial_state(problem.position, jnp.zeros_like(problem.position))
+    one, three = (
+        quick_jit(graph_inputs, static_argnums=2)(problem, state, STATE._replace(world_edges=number)).contacts
+        for number in (1, 3)
+    )
+    jax.tree.map(lambda few, many: np.testing.assert_array_equal(few, many[:count]), one, three)
+    position, body, found = (np.asarray(x) for x in (problem.position, problem.body.start, three.points))
+    away = np.sort(np.linalg.norm(position[:, None] - body[None], axis=2), axis=1)
+    found = np.linalg.norm(found.reshape(3, -1, 3) - position, axis=2)
+    np.testing.assert_allclose(found[1:].T, away[:, :2], atol=1e-6)
 
 
 def test_gradient_node_features(scene, gradient_graph):

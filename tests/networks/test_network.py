@@ -33,7 +33,7 @@ VARIANTS = {
     "paper": PAPER,
     "gradient": GRADIENT,
     "smoothing": SMOOTHING,
-    "state": dataclasses.replace(PAPER, features="state"),
+    "state": dataclasses.replace(PAPER, features="state", world_edges=2),
     "fixed-body": dataclasses.replace(PAPER, update_body=False),
     "one-hidden-layer": dataclasses.replace(PAPER, hidden_layers=1, remat="none"),
     "meshgraphnet": dataclasses.replace(PAPER, smoothing_steps=0, attention_blocks=0, remat="layers"),
@@ -81,9 +81,18 @@ def oracle(network, graph, garment):
     return plain_network(*(to_float64(tree) for tree in (network, graph, garment)))
 
 
+def with_world_edges(scene, count):
+    """Return a scene whose vertices have so many world edges, each with its own body point."""
+    garment, material, inputs = scene
+    others = [make_scene(8, 6, seed=seed)[2] for seed in range(1, count)]
+    contacts = jax.tree.map(lambda *rows: jnp.concatenate(rows), *(one.contacts for one in (inputs, *others)))
+    return garment, material, inputs.replace(contacts=contacts)
+
+
 @pytest.mark.parametrize("name", quick(VARIANTS, "paper", "state", "smoothing"))
 def test_network_matches_numpy(name, scene):
     config = VARIANTS[name]
+    scene = with_world_edges(scene, config.graph.world_edges)
     network, graph, actual = run(trained(config), *scene)
     assert_close(actual, oracle(network, graph, scene[0]))
 
