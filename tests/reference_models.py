@@ -315,7 +315,7 @@ def tube(num_around: int, num_along: int):
 def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool = False, seed: int = 0):
     """Return a tube, a fabric and random inputs; every tenth vertex is beyond the radius of world edges."""
     from eslr_jax import Material, prepare_garment
-    from eslr_jax.networks.features import GraphInputs
+    from eslr_jax.networks.features import RefinementInputs
     from eslr_jax.types import Contacts
 
     positions, faces = tube(num_around, num_along)
@@ -364,12 +364,11 @@ def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool 
         faces=jnp.zeros(len(distances), jnp.int32),
     )
     velocity = noise(0.01, 3)
-    inputs = GraphInputs(
+    inputs = RefinementInputs(
         position=position,
         velocity=velocity,
         timestep=jnp.float32(1 / 30),
         contacts=contacts if body else None,
-        body_velocity=noise(0.01, 3) if body else None,
         inertial_guess=position + velocity,
         guess=position + velocity + noise(0.002, 3),
         gradient=weight[:, None] * noise(1.0, 3),

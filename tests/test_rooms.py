@@ -22,7 +22,7 @@ KERNELS = {
     "numerics", "pose.lbs", "contact", "networks", "terms", "solver", "simulation.scene", "simulation.frame",
     "simulation.stepper", "simulation.rollout", "fabric.materials",
 }  # fmt: skip
-HOST_FILES = {"terms.worn", "networks.weights"}  # inside kernel rooms
+HOST_FILES = {"terms.worn", "networks.registry"}  # inside kernel rooms
 SHARED = {"errors", "ranges", "types", "config"}  # what kernels and host both read
 DOORS = {
     "jraph": {"networks"},

@@ -10,17 +10,8 @@ import jraph
 from jaxtyping import Array, Bool, Float
 
 from eslr_jax.contact.nearest import find_near_vertices
-from eslr_jax.networks import features, normalizer
-from eslr_jax.networks.build import (
-    COARSE_SETS,
-    GraphKind,
-    Rows,
-    Topology,
-    build_frame_graph,
-    build_graph,
-    build_refinement_graph,
-)
-from eslr_jax.networks.features import GraphInputs, required
+from eslr_jax.networks import build, features, normalizer
+from eslr_jax.networks.features import GraphInputs, RefinementInputs
 from eslr_jax.networks.network import Network, Prediction, Statistics
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver.guess import initial_guess
@@ -43,12 +34,12 @@ def apply_model(
     network: Network, graph: jraph.GraphsTuple, garment: Garment
 ) -> Float[Array, "vertices outputs"]:
     """Return the network's raw output for a graph of `build_graph`, of the network's kind; see `scale_output`."""
-    return _call(network, graph, Places(garment.geodesic_embedding, garment.vertex_mask), network.statistics)
+    return _call(network, graph, network.statistics, _places(garment))
 
 
 def encode_frame(network: Network, graph: jraph.GraphsTuple) -> Any:
     """Return what all refinement steps of a frame share, from a graph of `build_frame_graph`."""
-    return _call(network, graph, method="encode_frame")
+    return _call(network, graph, network.statistics, method="encode")
 
 
 def apply_refinement(
@@ -58,12 +49,11 @@ def apply_refinement(
 
     `encoded` is the result of `encode_frame`, and `changing` a graph of `build_refinement_graph`.
     """
-    places = Places(garment.geodesic_embedding, garment.vertex_mask)
+    return _call(network, encoded, _places(garment), changing, method="process")
 
-    def run(module: Any):
-        return module.process(module.encode_refinement(encoded, changing), places)
 
-    return _call(network, method=run)
+def _places(garment: Garment) -> Places:
+    return Places(garment.geodesic_embedding, garment.vertex_mask)
 
 
 def _call(network: Network, *args: Any, **options: Any) -> Any:
@@ -97,23 +87,20 @@ def measure_statistics(
     if network.config.reads_gradient:
         return measured
     nodes = jax.lax.stop_gradient(_call(network, graph, method="with_types"))
-    edges = cast(Rows, graph.edges)
+    edges, topology = cast(build.Rows, graph.edges), cast(build.Topology, graph.globals)
     masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
-    coarse = cast(Topology, graph.globals).get("coarse", ())
-    masks |= {name: level.edge_mask for name, level in zip(COARSE_SETS, coarse, strict=False)}
+    levels = zip(build.COARSE_SETS, topology.get("coarse", ()), strict=False)
+    masks |= {name: level.edge_mask for name, level in levels}
     world = {name: rows for name, rows in edges.items() if name.startswith("world")}
     mesh = {name: rows for name, rows in edges.items() if name not in world}
-    groups = (
+    for name, group, num_static in (
         ("garment", nodes, features.HOOD_NODE_STATIC),
         ("mesh", mesh, features.HOOD_MESH_STATIC),
         ("world", world, 0),
-    )
-    for name, group, num_static in groups:
+    ):
         if group:
             rows = jnp.concatenate(list(group.values()))
-            mask = jnp.concatenate(
-                [masks[kind] if kind in masks else graph.globals["world_mask"] for kind in group]
-            )
+            mask = jnp.concatenate([masks.get(kind, topology.get("world_mask")) for kind in group])
             measured[name] = normalizer.measure(rows[:, : rows.shape[1] - num_static], mask)
     measured["output"] = normalizer.measure(acceleration, garment.vertex_mask)
     return measured
@@ -126,16 +113,15 @@ def merge_statistics(network: Network, measured: Statistics) -> Network:
     return network.replace(statistics={**seen, **merged})
 
 
-def graph_inputs(problem: FrameProblem, state: ClothState, kind: GraphKind) -> GraphInputs:
+def graph_inputs(problem: FrameProblem, state: ClothState, kind: build.GraphKind) -> GraphInputs:
     """Return what a graph of a kind is built from; pinned vertices already carry their next target (HOOD)."""
     position = pin(problem, state.position)
     velocity = state.velocity * problem.timestep
     if problem.pin_targets is not None:
         is_pinned = problem.garment.is_pinned[:, None]
         velocity = jnp.where(is_pinned, position - state.position, velocity)
-    touched = problem.data_of(Collision)
+    touched, body, others = problem.data_of(Collision), problem.body, kind.world_edges - 1
     contacts = None if touched is None else touched.nearest
-    body, others = problem.body, kind.world_edges - 1
     if contacts is not None and body is not None and others:
         near = find_near_vertices(position, body.start, body.end, body.surface, others)
         contacts = jax.tree.map(lambda *rows: jnp.concatenate(rows), contacts, near)
@@ -144,7 +130,6 @@ def graph_inputs(problem: FrameProblem, state: ClothState, kind: GraphKind) -> G
         velocity=velocity,
         timestep=problem.timestep,
         contacts=contacts,
-        body_velocity=None if contacts is None else contacts.next_points - contacts.points,
         inertial_guess=problem.inertial_guess,
         weight=problem.gravity * problem.masses,
     )
@@ -156,7 +141,7 @@ def predict_acceleration(network: Network, problem: FrameProblem, state: ClothSt
     Source: the paper's method section, Q' = Q + A dt and X' = X + Q' dt, in HOOD's per-frame units.
     """
     inputs = graph_inputs(problem, state, network.config.graph)
-    graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
+    graph = build.build_graph(problem.garment, problem.material, inputs, network.config.graph)
     output = apply_model(network, graph, problem.garment)
     velocity = inputs.velocity + scale_output(network, output)
     return Prediction(pin(problem, inputs.position + velocity)[None])
@@ -178,41 +163,44 @@ def refine(network: Network, problem: FrameProblem, state: ClothState, *, detach
     """
     garment, material, config = problem.garment, problem.material, network.config
     inputs = graph_inputs(problem, state, config.graph)
-    graph = build_frame_graph(garment, material, inputs, config.graph)
+    graph = build.build_frame_graph(garment, material, inputs, config.graph)
     guess = initial_guess(problem)
-    zeros = jnp.zeros_like(guess.position)
-    inputs = inputs.replace(
-        guess=guess.position, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
-    )
     encoded = encode_frame(network, graph)
-    longest: Array = graph.globals["edge_length"]  # type: ignore[index, assignment]: jraph's trees
+    longest: Array = graph.globals["edge_lengths"]["mesh"]  # type: ignore[index, call-overload]: jraph's trees
 
-    def one_step(carry: GraphInputs, _):
-        point = evaluate(required(carry, "guess"), problem)
+    def one_step(carry: tuple[Array, Array, Array], _):
+        start, correction, previous_gradient = carry
+        point = evaluate(start, problem)
         # The stretch energy grows with the fourth power of a displacement: from a torn-up state, full steps would
         # overshoot further each time. The bound is a trust region of one mesh spacing.
         step = solve_stiffness(stiffness(problem, point.position), -point.gradient)
         step = step * (longest / jnp.maximum(safe_norm(step, keepdims=True), longest))
-        inputs = carry.replace(gradient=point.gradient, step=step)
-        changing = build_refinement_graph(garment, material, inputs, graph)
+        now = RefinementInputs(
+            **vars(inputs),
+            guess=start,
+            gradient=point.gradient,
+            step=step,
+            correction=correction,
+            previous_gradient=previous_gradient,
+        )
+        changing = build.build_refinement_graph(garment, material, now, graph)
         output = apply_refinement(network, encoded, changing, garment)
         move = scale_output(network, output[:, :3])
         if config.has_gates:  # one per vertex scales the step (1 + gate), another the last correction
-            move = move + (1.0 + output[:, 3:4]) * step + output[:, 4:5] * required(inputs, "correction")
+            move = move + (1.0 + output[:, 3:4]) * step + output[:, 4:5] * correction
         if config.is_combined:
-            directions = jnp.stack([move, inputs.step, inputs.correction])
+            directions = jnp.stack([move, step, correction])
             if problem.pin_targets is not None:
                 directions = jnp.where(garment.is_pinned[:, None], 0.0, directions)
             move = combine_directions(
                 lambda x: potential(x, problem), point, directions, fixed_weights=detach
             )
-        position = pin(problem, inputs.guess + move)
+        position = pin(problem, start + move)
         onward = jax.lax.stop_gradient(position) if detach else position
-        later = inputs.replace(
-            guess=onward, correction=onward - point.position, previous_gradient=point.gradient
-        )
-        return later, (position, point)
+        return (onward, onward - point.position, point.gradient), (position, point)
 
-    _, (positions, starts) = jax.lax.scan(one_step, inputs, None, length=config.refinement_steps)
+    zeros = jnp.zeros_like(guess.position)
+    first = (guess.position, zeros, zeros)
+    _, (positions, starts) = jax.lax.scan(one_step, first, None, length=config.refinement_steps)
     lowest = jnp.nanargmin(starts.value)
     return Prediction(positions, guess, jax.tree.map(lambda rows: rows[lowest], starts))

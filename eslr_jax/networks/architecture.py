@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal, cast
 
 import flax.linen as nn
@@ -14,6 +14,7 @@ import jraph
 import numpy as np
 from jaxtyping import Array, Float
 
+from eslr_jax.config import check_numbers
 from eslr_jax.errors import CheckpointError
 from eslr_jax.networks import features, normalizer
 from eslr_jax.networks.apply import Places, predict_acceleration, refine
@@ -29,7 +30,7 @@ _MAY_BE_ZERO = ("smoothing_steps", "attention_blocks", "hidden_layers", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
-class Architecture(System, abc.ABC):
+class Architecture(System):
     """Options of every network on a garment's graph.
 
     Without `correction_scale` it predicts an acceleration, as in the paper, from `features`: HOOD's, or these and
@@ -46,6 +47,7 @@ class Architecture(System, abc.ABC):
     # What a backward pass computes again: whole layers, all but their products, or nothing.
     remat: Literal["layers", "products", "none"] = "products"
 
+    module_class: ClassVar[Callable[[Any], nn.Module]]  # an `eslr.GraphModule`
     has_gates: ClassVar[bool] = False  # the output has two of them behind the vector
     is_combined: ClassVar[Any] = False  # a refinement step minimises over its directions
 
@@ -55,13 +57,7 @@ class Architecture(System, abc.ABC):
         Raises:
             ValueError: Names the field.
         """
-        for field in dataclasses.fields(self):
-            value, name = getattr(self, field.name), field.name
-            if isinstance(value, int) and not isinstance(value, bool) and value < (name not in _MAY_BE_ZERO):
-                least = "must not be negative" if name in _MAY_BE_ZERO else "must be at least 1"
-                raise ValueError(f"{name} {least}, got {value}")
-            if isinstance(value, float) and not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
+        check_numbers(self, may_be_zero=_MAY_BE_ZERO)
 
     @property
     def form(self) -> str:
@@ -86,9 +82,9 @@ class Architecture(System, abc.ABC):
         return GraphKind(self.reads_gradient, self.reads_state, world_edge_radius=self.world_edge_radius)
 
     @property
-    @abc.abstractmethod
     def module(self) -> nn.Module:
-        """The Flax module, with the methods of `eslr.EncodeProcessDecode`."""
+        """The Flax module."""
+        return self.module_class(self)
 
     def draw_constants(self) -> dict[str, Any]:
         """Return arrays that are not trained."""
@@ -99,7 +95,7 @@ class Architecture(System, abc.ABC):
 
         @jax.jit
         def declare() -> Any:
-            return self.module.init(jax.random.key(0), *_example(self), _new_statistics(self))["params"]
+            return self.module.init(jax.random.key(0), *_example(self))["params"]
 
         return Network(draw_weights(declare(), seed), self, _new_statistics(self), self.draw_constants())
 
@@ -164,8 +160,8 @@ def _new_statistics(config: Architecture) -> Statistics:
     return {name: normalizer.init_normalizer(count) for name, count in columns.items()}
 
 
-def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Places]:
-    """Return the smallest graph that touches every weight: one edge, two body points."""
+def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Statistics, Places]:
+    """Return what a module reads: the smallest graph that touches every weight, one edge, two body points."""
     kind = config.graph
     sizes, zeros, pair = feature_sizes(kind), functools.partial(jnp.zeros, dtype=jnp.float32), jnp.arange(2)
     worlds = ("world", "world_reverse") if kind.has_reverse_edges else ("world",)
@@ -190,7 +186,7 @@ def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Places]:
         n_edge={name: jnp.array([2]) for name in (*edges, *worlds)},
     )
     width = getattr(config, "embedding_size", 0)  # what attention reads, where there is any
-    return graph, Places(zeros((2, width)), jnp.ones(2, bool))
+    return graph, _new_statistics(config), Places(zeros((2, width)), jnp.ones(2, bool))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,8 +255,8 @@ def stack(module: type[nn.Module], config: Architecture, length: int, **attribut
     return scanned(config, **attributes)
 
 
-def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "vertices 1"]:
-    """Return one for every vertex with a world edge, zero for the others; zeros without a body."""
+def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "world_edges 1"]:
+    """Return one for every world edge within reach, zero for the others; zeros without a body."""
     rows = graph.nodes["garment"].shape[0]
     mask = cast(Topology, graph.globals).get("world_mask", jnp.zeros(rows, bool))
     return mask.astype(dtype)[:, None]

@@ -20,13 +20,7 @@ RELU_EPSILON = 1e-3  # PyTorch Geometric's generalised kernel
 def orthogonal_projection(num_features: int, size: int, seed: int) -> np.ndarray:
     """Return random directions, orthogonal within blocks of `size`, with the lengths of Gaussian vectors.
 
-    Args:
-        num_features: Number of directions.
-        size: Dimension of a direction.
-        seed: Seed of NumPy's generator; it gives the same directions on every machine.
-
-    Returns:
-        Directions, shape [num_features, size].
+    NumPy's generator gives the same ones on every machine, shape [num_features, size].
 
     Source: Choromanski et al. (2021), section 2.4.
     """

@@ -22,7 +22,7 @@ Networks map over scenes with `jax.vmap` in the place of a batch.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypedDict, cast
+from typing import NamedTuple, TypedDict
 
 import jax.numpy as jnp
 import jraph
@@ -30,7 +30,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
-from eslr_jax.networks.features import GraphInputs, required
+from eslr_jax.networks.features import GraphInputs, RefinementInputs
+from eslr_jax.networks.operators import to_world_edges
 from eslr_jax.numerics import safe_norm
 from eslr_jax.types import CoarseEdges, Garment, Material
 
@@ -59,7 +60,7 @@ class Topology(TypedDict, total=False):
     reverse_edges: Int[Array, " edges"]  # index of the opposite mesh edge
     incoming_edges: Int[Array, "vertices degree"]  # mesh edges that enter a vertex, padded with their number
     coarse: tuple[CoarseEdges, ...]  # coarse levels, finest first; hierarchical networks
-    edge_length: Float[Array, ""]  # mean rest edge length [m]; features "gradient"
+    edge_lengths: dict[str, Float[Array, ""]]  # mean at rest of every set [m]; features "gradient"
     garment_type: Int[Array, " vertices"]  # HOOD's vertex type; features "hood"
     body_type: Int[Array, " world_edges"]  # the same of the body rows
     world_mask: Bool[Array, " world_edges"]  # that are within reach
@@ -74,7 +75,7 @@ def build_graph(
         ConfigError: The network is hierarchical and the garment has no coarse levels.
     """
     graph = build_frame_graph(garment, material, inputs, kind)
-    if not kind.reads_gradient:
+    if not isinstance(inputs, RefinementInputs) or not kind.reads_gradient:
         return graph
     return join_features(graph, build_refinement_graph(garment, material, inputs, graph))
 
@@ -83,63 +84,52 @@ def build_frame_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
     """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static."""
-    is_hood = not kind.reads_gradient
-
-    def hood_edges(level: Garment | CoarseEdges) -> Array:
-        rows = features.hood_edge_features(garment, material, inputs, level)
-        state = [features.state_edge_features(garment, inputs, level)] if kind.reads_state else []
-        return jnp.concatenate([*state, rows], axis=1)  # columns that are not normalised stay last
-
+    levels: dict[str, Garment | CoarseEdges] = {"mesh": garment}
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,
         "incoming_edges": incoming_edges(garment.neighbor_mask, garment.receivers.shape[0]),
     }
-    senders, receivers = {"mesh": garment.senders}, {"mesh": garment.receivers}
-    if is_hood:
-        topology["garment_type"] = jnp.where(garment.is_pinned, features.TYPE_PINNED, features.TYPE_GARMENT)
-        nodes = {"garment": features.hood_garment_features(garment, material, inputs)}
-        edges = {"mesh": hood_edges(garment)}
-    else:
-        spacing = topology["edge_length"] = features.mean_edge_length(garment, garment)
-        nodes = {"garment": features.frame_node_features(garment, material, inputs, spacing)}
-        edges = {"mesh": features.frame_mesh_features(garment, inputs.position, garment, spacing)}
     if kind.has_coarse_edges:
         if garment.coarse is None:
             raise ConfigError(
                 "the network is hierarchical and the garment has no coarse levels; add_coarse_edges adds them"
             )
         topology["coarse"] = garment.coarse
-        for name, level in zip(COARSE_SETS, garment.coarse, strict=True):
-            edges[name] = (
-                hood_edges(level)
-                if is_hood
-                else features.frame_mesh_features(
-                    garment, inputs.position, level, features.mean_edge_length(garment, level)
-                )
-            )
-            senders[name], receivers[name] = level.senders, level.receivers
-    if inputs.contacts is not None:
-        # A contact of thrown cloth is measured on its path; HOOD's edges join what is near now.
-        signed, count = inputs.contacts.distances, garment.vertex_mask.shape[0]
-        away = jnp.abs(signed)
-        if kind.reads_state:  # a vertex deep in the body needs its edge to the surface most
-            away = jnp.concatenate([signed[:count], away[count:]])
-        elif is_hood:
-            position = features.per_world_edge(inputs.position, inputs.contacts)
-            away = safe_norm(inputs.contacts.points - position)
+        levels |= dict(zip(COARSE_SETS, garment.coarse, strict=True))
+    if kind.reads_gradient:
+        lengths = {name: features.mean_edge_length(garment, level) for name, level in levels.items()}
+        topology["edge_lengths"] = lengths
+        nodes = {"garment": features.frame_node_features(garment, material, inputs, lengths["mesh"])}
+        edges = {
+            name: features.frame_mesh_features(garment, inputs.position, level, lengths[name])
+            for name, level in levels.items()
+        }
+    else:
+        topology["garment_type"] = jnp.where(garment.is_pinned, features.TYPE_PINNED, features.TYPE_GARMENT)
+        nodes = {"garment": features.hood_garment_features(garment, material, inputs)}
+        edges = {
+            name: features.hood_edge_features(garment, material, inputs, level, reads_state=kind.reads_state)
+            for name, level in levels.items()
+        }
+    senders = {name: level.senders for name, level in levels.items()}
+    receivers = {name: level.receivers for name, level in levels.items()}
+    if (contacts := inputs.contacts) is not None:
+        signed, count = contacts.distances, garment.vertex_mask.shape[0]
+        if kind.reads_gradient:
+            away = jnp.abs(signed)
+        elif kind.reads_state:  # a vertex deep in the body needs its edge to the surface most
+            away = jnp.abs(signed).at[:count].set(signed[:count])
+        else:  # a contact of thrown cloth is measured on its path; HOOD's edges join what is near now
+            away = safe_norm(contacts.points - to_world_edges(inputs.position, signed.shape[0]))
         mask = (away <= kind.world_edge_radius) & jnp.tile(garment.vertex_mask, kind.world_edges)
         topology["world_mask"] = mask
-        contacts, velocity = inputs.contacts, required(inputs, "body_velocity")
-        if is_hood:
-            topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
-            body = features.hood_body_features(velocity, contacts.normals, inputs.timestep)
-            world = features.hood_world_features(contacts, inputs)
-            if kind.reads_state:
-                world = jnp.concatenate([world, features.state_world_features(contacts, inputs)], axis=1)
+        if kind.reads_gradient:
+            body = features.frame_body_features(contacts, inputs.timestep)
+            world = features.frame_world_features(contacts, inputs)
         else:
-            inertial_guess = required(inputs, "inertial_guess")
-            body = features.frame_body_features(velocity, contacts, inputs.timestep)
-            world = features.frame_world_features(inputs.position, contacts, inertial_guess)
+            topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
+            body = features.hood_body_features(contacts, inputs.timestep)
+            world = features.hood_world_features(contacts, inputs, reads_state=kind.reads_state)
         nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
         senders["world"] = jnp.arange(mask.shape[0])
         receivers["world"] = senders["world"] % count
@@ -160,9 +150,7 @@ def build_frame_graph(
 def edge_set(graph: jraph.GraphsTuple, name: str) -> jraph.GraphsTuple:
     """Return one set of edges as a graph for jraph's own functions: `jraph.batch`, `jraph.unbatch` and others.
 
-    Args:
-        graph: Of `build_graph`, `build_frame_graph` or `build_refinement_graph`.
-        name: Set of edges, such as "mesh". Its senders and receivers are rows of the nodes that it joins.
+    Its senders and receivers are rows of the nodes that it joins.
     """
     return graph._replace(
         edges=graph.edges[name],
@@ -174,23 +162,18 @@ def edge_set(graph: jraph.GraphsTuple, name: str) -> jraph.GraphsTuple:
 
 
 def build_refinement_graph(
-    garment: Garment, material: Material, inputs: GraphInputs, frame_graph: jraph.GraphsTuple
+    garment: Garment, material: Material, inputs: RefinementInputs, frame_graph: jraph.GraphsTuple
 ) -> jraph.GraphsTuple:
-    """Return the features that change with every refinement step, on the topology of `frame_graph`.
-
-    Raises:
-        ValueError: A field of `inputs` that these features need is None.
-    """
-    spacing = frame_graph.globals["edge_length"]
-    guess = required(inputs, "guess")
-    nodes = {"garment": features.refinement_node_features(garment, material, inputs, spacing)}
-    edges = {"mesh": features.refinement_mesh_features(garment, guess, garment, spacing)}
-    coarse = cast(Topology, frame_graph.globals).get("coarse", ())
-    for name, level in zip(COARSE_SETS, coarse, strict=False):
-        length = features.mean_edge_length(garment, level)
-        edges[name] = features.refinement_mesh_features(garment, guess, level, length)
+    """Return the features that change with every refinement step, on the topology of `frame_graph`."""
+    lengths = frame_graph.globals["edge_lengths"]
+    nodes = {"garment": features.refinement_node_features(garment, material, inputs, lengths["mesh"])}
+    levels = zip(lengths.items(), (garment, *(garment.coarse or ())), strict=False)
+    edges = {
+        name: features.refinement_mesh_features(garment, inputs.guess, level, length)
+        for (name, length), level in levels
+    }
     if inputs.contacts is not None:
-        world = features.refinement_world_features(guess, inputs.contacts)
+        world = features.refinement_world_features(inputs.guess, inputs.contacts)
         edges["world"] = _mask_rows(world, frame_graph.globals["world_mask"])
         if "world_reverse" in frame_graph.edges:
             edges["world_reverse"] = edges["world"]  # distances have no direction

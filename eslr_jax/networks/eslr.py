@@ -10,9 +10,10 @@ Source: paper, section on the simulation pipeline.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Float, Int
@@ -33,33 +34,41 @@ from eslr_jax.types import Normalizer
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 
-class Encoded(NamedTuple):
-    """Hidden layers of the encoders, as far as a frame's constant features decide them.
-
-    Body rows are finished: they have no features that change.
-    """
-
-    garment: Float[Array, "vertices hidden"]
-    mesh: Float[Array, "edges hidden"]
-    tables: LayerTables
-    world: WorldLatents | None  # None in a scene without a body
-
-
 class GraphModule(nn.Module):
-    """A module that reads HOOD's features through their normalisers, with an embedding of the vertex type."""
+    """A module with what `networks.apply` calls.
+
+    It also has `encode(graph, statistics)`, which returns what all refinement steps of a frame share, and
+    `process(encoded, places, changing=None)`, which returns the raw output, shape [vertices, outputs]; `changing`
+    holds the features of a refinement step, of `build_refinement_graph`.
+    """
 
     config: Any
 
-    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
+    def declare_encoders(self, more_columns: int = 0) -> None:
+        """Declare encoders, that of a vertex with `more_columns`, and HOOD's embedding of the vertex type."""
+        config, sizes = self.config, feature_sizes(self.config.graph)
+        types = 0 if config.reads_gradient else features.NUM_TYPES
+        if types:
+            self.type_embedding = self.param("type_embedding", kernel_spread(types), (types, types))
+        else:
+            self.body_encoder = make_mlp(config, sizes["body"])
+        self.garment_encoder = make_mlp(config, sizes["garment"] + types + more_columns)
+        self.mesh_encoder = make_mlp(config, sizes["mesh"])
+        self.world_encoder = make_mlp(config, sizes["world"])
+
+    def __call__(
+        self, graph: jraph.GraphsTuple, statistics: Statistics, places: Places
+    ) -> Float[Array, "vertices outputs"]:
+        """Return the raw output for a whole graph; `statistics` are the normalisers of HOOD's features."""
+        return self.process(self.encode(graph, statistics), places)
+
+    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics) -> tuple[Rows, Rows]:
         """Return node and edge features as the encoders read them.
 
-        Raises:
-            ValueError: The features are HOOD's and `statistics` is None.
+        HOOD's go through their normalisers, with an embedding of the vertex type.
         """
         if self.config.reads_gradient:
             return graph.nodes, graph.edges
-        if statistics is None:
-            raise ValueError("HOOD's features need the statistics of their normalisers")
 
         def scale(
             rows: Float[Array, "_ features"], normalizer: Normalizer, num_static: int
@@ -100,19 +109,8 @@ class EncodeProcessDecode(GraphModule):
 
     def setup(self) -> None:
         """Declare encoders, stacks and decoder."""
-        config, sizes = self.config, feature_sizes(self.config.graph)
-        if not config.reads_gradient:
-            self.type_embedding = self.param(
-                "type_embedding",
-                kernel_spread(features.NUM_TYPES),
-                (features.NUM_TYPES, features.NUM_TYPES),
-            )
-            self.garment_encoder = make_mlp(config, sizes["garment"] + features.NUM_TYPES)
-        else:
-            self.garment_encoder = make_mlp(config, sizes["garment"])
-            self.body_encoder = make_mlp(config, sizes["body"])
-        self.mesh_encoder = make_mlp(config, sizes["mesh"])
-        self.world_encoder = make_mlp(config, sizes["world"])
+        config = self.config
+        self.declare_encoders()
         self.layers = stack(LsdmpLayer, config, config.message_passing_steps)
         if config.attention_blocks:
             self.blocks = stack(GsaBlock, config, config.attention_blocks)
@@ -120,65 +118,51 @@ class EncodeProcessDecode(GraphModule):
             self.projection = self.variable("constants", "projection", jnp.zeros, shape)
         self.decoder = make_decoder(config, 2 if config.attention_blocks else 1)
 
-    def __call__(
-        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
-    ) -> Float[Array, "vertices outputs"]:
-        """Return the raw output for a whole graph; `statistics` are the normalisers of HOOD's features."""
-        return self.process(self.encode_frame(graph, statistics), places)
+    def encode(self, graph: jraph.GraphsTuple, statistics: Statistics) -> tuple[Latents, LayerTables]:
+        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame.
 
-    def encode_frame(self, graph: jraph.GraphsTuple, statistics: Statistics | None = None) -> Encoded:
-        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame."""
+        Body rows are finished: they have no features that change.
+        """
         nodes, edges = self.normalized(graph, statistics)
         dtype = nodes["garment"].dtype
         world = None
         if "world" in edges:
             body_encoder = self.body_encoder if self.config.reads_gradient else self.garment_encoder
-            first_layers = {
-                name: self.world_encoder.start(edges[name], 0, bias=True)
+            toward, reverse = (
+                self.world_encoder.start(edges[name], 0, bias=True) if name in edges else None
                 for name in ("world", "world_reverse")
-                if name in edges
-            }
-            world = WorldLatents(
-                body=body_encoder(nodes["body"]),
-                edges=first_layers["world"],
-                reverse=first_layers.get("world_reverse"),
             )
-        return Encoded(
-            garment=self.garment_encoder.start(nodes["garment"], 0, bias=True),
-            mesh=self.mesh_encoder.start(edges["mesh"], 0, bias=True),
-            tables=LayerTables(mesh_tables(graph, dtype), world_mask(graph, dtype)),
-            world=world,
-        )
+            world = WorldLatents(body_encoder(nodes["body"]), toward, reverse)
+        garment = self.garment_encoder.start(nodes["garment"], 0, bias=True)
+        hidden = Latents(garment, {"mesh": self.mesh_encoder.start(edges["mesh"], 0, bias=True)}, world)
+        return hidden, LayerTables({"mesh": mesh_tables(graph, dtype)}, world_mask(graph, dtype))
 
-    def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
-        """Add the features of a refinement step, of `build_refinement_graph`, to those of its frame."""
-        nodes, edges, world = changing.nodes, changing.edges, encoded.world
-        if world is not None:
-            rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
-            reverse = None if world.reverse is None else world.reverse + rows
-            world = world._replace(edges=world.edges + rows, reverse=reverse)
-        return encoded._replace(
-            garment=encoded.garment + self.garment_encoder.start(nodes["garment"], features.NODE_FRAME_SIZE),
-            mesh=encoded.mesh + self.mesh_encoder.start(edges["mesh"], features.MESH_FRAME_SIZE),
-            world=world,
-        )
-
-    def process(self, encoded: Encoded, places: Places) -> Float[Array, "vertices outputs"]:
+    def process(
+        self,
+        encoded: tuple[Latents, LayerTables],
+        places: Places,
+        changing: jraph.GraphsTuple | None = None,
+    ) -> Float[Array, "vertices outputs"]:
         """Finish the encoders, run both stacks and decode.
 
         Raises:
             ConfigError: The garment has another number of geodesic coordinates than the network reads.
         """
-        config = self.config
-        vertices = self.garment_encoder.finish(encoded.garment)
-        mesh = self.mesh_encoder.finish(encoded.mesh)
-        world = None
-        if encoded.world is not None:
-            finish, given = self.world_encoder.finish, encoded.world
-            reverse = None if given.reverse is None else finish(given.reverse)
-            world = WorldLatents(given.body, finish(given.edges), reverse)
-        latents = Latents(vertices, mesh, sum_receivers(mesh, encoded.tables.mesh), world)
-        latents, _ = self.layers(latents, encoded.tables)
+        config, (hidden, tables) = self.config, encoded
+        garment, mesh, world = hidden.garment, hidden.edges["mesh"], hidden.world
+        along = () if world is None else (world.edges, world.reverse)
+        if changing is not None:
+            nodes, edges = changing.nodes, changing.edges
+            garment = garment + self.garment_encoder.start(nodes["garment"], features.NODE_FRAME_SIZE)
+            mesh = mesh + self.mesh_encoder.start(edges["mesh"], features.MESH_FRAME_SIZE)
+            if world is not None:
+                rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
+                along = jax.tree.map(lambda given: given + rows, along)
+        vertices, mesh = self.garment_encoder.finish(garment), self.mesh_encoder.finish(mesh)
+        if world is not None:
+            world = WorldLatents(world.body, *jax.tree.map(self.world_encoder.finish, along))
+        mesh_sum = sum_receivers(mesh, tables.edges["mesh"]) if config.smoothing_steps else None
+        latents, _ = self.layers(Latents(vertices, {"mesh": mesh}, world, mesh_sum), tables)
         hidden = self.decoder.start(latents.garment, 0, bias=True)
         if config.attention_blocks:
             size = places.embedding.shape[1]
@@ -197,6 +181,7 @@ class EncodeProcessDecode(GraphModule):
 class Eslr(TwoBranches):
     """The paper's network; the defaults are its 15-layer model (4,753,108 parameters)."""
 
+    module_class = EncodeProcessDecode
     update_body: bool = False  # open: layers update body rows as HOOD does, see models.lsdmp
     world_edges: int = 1  # of a vertex, at most: pairs within `world_edge_radius` (paper: all of them)
 
@@ -204,8 +189,3 @@ class Eslr(TwoBranches):
     def graph(self) -> GraphKind:
         """What the network reads of a frame."""
         return super().graph._replace(has_reverse_edges=self.update_body, world_edges=self.world_edges)
-
-    @property
-    def module(self) -> EncodeProcessDecode:
-        """The Flax module."""
-        return EncodeProcessDecode(self)

@@ -16,6 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.fabric.materials import COTTON
+from eslr_jax.networks.operators import to_world_edges
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
@@ -49,41 +50,31 @@ STATE_MESH_SIZE, STATE_WORLD_SIZE = 5, 2  # columns of the kind "state" beside H
 
 @struct.dataclass
 class GraphInputs:
-    """State of a garment and of the body beside it, at a frame or at one refinement step of a frame.
+    """State of a garment and of the body beside it, at a frame.
 
     Lengths are in metres. Velocities are in metres per frame, the unit of HOOD's features. Pinned vertices
     already have their next target as `position`, and their way to it as `velocity`.
-
-    `contacts` and `body_velocity` are None in a scene without a body. They have a row per world edge, and all
-    vertices have as many world edges: all their first ones, then all their second ones. Only features of the kind
-    "gradient" read the fields from `inertial_guess` on. `correction` and `previous_gradient` are None or zero at
-    the first refinement step of a frame.
+    `contacts` is None in a scene without a body. It has a row per world edge, and all vertices have as many world
+    edges: all their first ones, then all their second ones.
     """
 
     position: Float[Array, "vertices 3"]  # [m]
     velocity: Float[Array, "vertices 3"]  # [m per frame]
     timestep: Float[Array, ""]  # [s]
-    contacts: Contacts | None = None
-    body_velocity: Float[Array, "world_edges 3"] | None = None  # of the nearest body points [m per frame]
-    inertial_guess: Float[Array, "vertices 3"] | None = None  # where inertia alone leads [m]
-    guess: Float[Array, "vertices 3"] | None = None  # what the step corrects [m]
-    gradient: Float[Array, "vertices 3"] | None = None  # of the potential at `guess` [N]
-    step: Float[Array, "vertices 3"] | None = None  # preconditioned step down that gradient [m]
-    weight: Float[Array, " vertices"] | None = None  # m g [N]
-    correction: Float[Array, "vertices 3"] | None = None  # that led to `guess` [m]
-    previous_gradient: Float[Array, "vertices 3"] | None = None  # before that correction [N]
+    contacts: Contacts | None
+    inertial_guess: Float[Array, "vertices 3"]  # where inertia alone leads [m]
+    weight: Float[Array, " vertices"]  # m g [N]
 
 
-def required(inputs: GraphInputs, name: str) -> Array:
-    """Return a field of `inputs` that a kind of features cannot do without.
+@struct.dataclass
+class RefinementInputs(GraphInputs):
+    """The same at one refinement step of a frame; the last two are zero at the first one."""
 
-    Raises:
-        ValueError: The field is None.
-    """
-    value = getattr(inputs, name)
-    if value is None:
-        raise ValueError(f"GraphInputs.{name} is None, but the features of this model need it; set it")
-    return value
+    guess: Float[Array, "vertices 3"]  # what the step corrects [m]
+    gradient: Float[Array, "vertices 3"]  # of the potential at `guess` [N]
+    step: Float[Array, "vertices 3"]  # preconditioned step down that gradient [m]
+    correction: Float[Array, "vertices 3"]  # that led to `guess` [m]
+    previous_gradient: Float[Array, "vertices 3"]  # before that correction [N]
 
 
 def clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -97,16 +88,10 @@ def to_vertices(
     incidence: Int[Array, "vertices degree"],
     corners: int,
 ) -> Float[Array, " vertices"]:
-    """Average a material constant of faces or hinges onto the vertices; a scalar is repeated.
+    """Return a material constant of items, faces or hinges, as weighted means around every vertex.
 
-    Args:
-        values: One value for all items, or values of shape [items].
-        weights: Weight of every item, shape [items]; an item of weight zero does not count.
-        incidence: Items around every vertex, shape [vertices, degree]; see `numerics.sum_incident`.
-        corners: Number of vertices of an item.
-
-    Returns:
-        Weighted means, shape [vertices]; the mean over all items where a vertex has none.
+    `values` are of all items or a scalar, which is repeated; `corners` is the number of vertices of an item, see
+    `numerics.sum_incident`. A vertex without items has the mean over all.
     """
     if values.ndim == 0:
         return jnp.broadcast_to(values, (incidence.shape[0],))
@@ -142,15 +127,14 @@ def material_inputs(garment: Garment, material: Material) -> Float[Array, "verti
         return (jnp.log(jnp.maximum(x, 1e-30)) - jnp.log(low)) / (jnp.log(high) - jnp.log(low))
 
     low, high = LAME_LAMBDA_RANGE
-    return jnp.stack(
-        [log_scale(bending, *BENDING_RANGE), log_scale(mu, *LAME_MU_RANGE), (lam - low) / (high - low)],
-        axis=1,
+    return jnp.column_stack(
+        [log_scale(bending, *BENDING_RANGE), log_scale(mu, *LAME_MU_RANGE), (lam - low) / (high - low)]
     )
 
 
-def per_world_edge(rows: Float[Array, "vertices _"], contacts: Contacts) -> Float[Array, "world_edges _"]:
-    """Return the row of every world edge's vertex; see `GraphInputs`."""
-    return jnp.tile(rows, (contacts.points.shape[0] // rows.shape[0], 1))
+def with_norm(vectors: Float[Array, "rows 3"]) -> Float[Array, "rows 4"]:
+    """Return vectors with their lengths behind them."""
+    return jnp.column_stack([vectors, safe_norm(vectors)])
 
 
 def log_positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -180,80 +164,63 @@ def hood_garment_features(
 
     The model inserts the embedding of the vertex type behind the velocity, which makes 20 columns.
     """
-    column = jnp.broadcast_to(inputs.timestep, (inputs.position.shape[0], 1))
-    mass = log_positive(vertex_masses(garment, material))[:, None]
+    timestep = jnp.broadcast_to(inputs.timestep, inputs.position.shape[:1])
+    mass = log_positive(vertex_masses(garment, material))
     normals = vertex_normals(inputs.position, garment.faces, garment.face_incidence)
-    return jnp.concatenate(
-        [inputs.velocity, normals, column, mass, material_inputs(garment, material)], axis=1
-    )
+    return jnp.column_stack([inputs.velocity, normals, timestep, mass, material_inputs(garment, material)])
 
 
-def hood_body_features(
-    velocity: Float[Array, "world_edges 3"],
-    normals: Float[Array, "world_edges 3"],
-    timestep: Float[Array, ""],
-) -> Float[Array, "world_edges 11"]:
+def hood_body_features(contacts: Contacts, timestep: Float[Array, ""]) -> Float[Array, "world_edges 11"]:
     """Return the columns of `hood_garment_features` for body points; mass and material are -1."""
-    num_rows = velocity.shape[0]
-    column = jnp.broadcast_to(timestep, (num_rows, 1))
-    return jnp.concatenate([velocity, normals, column, -jnp.ones((num_rows, 4), velocity.dtype)], axis=1)
+    velocity = contacts.next_points - contacts.points
+    unknown = -jnp.ones((velocity.shape[0], 4), velocity.dtype)
+    column = jnp.broadcast_to(timestep, velocity.shape[:1])
+    return jnp.column_stack([velocity, contacts.normals, column, unknown])
 
 
 def hood_edge_features(
-    garment: Garment, material: Material, inputs: GraphInputs, edges: Garment | CoarseEdges
-) -> Float[Array, "edges 12"]:
+    garment: Garment,
+    material: Material,
+    inputs: GraphInputs,
+    edges: Garment | CoarseEdges,
+    *,
+    reads_state: bool,
+) -> Float[Array, "edges features"]:
     """Return sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3.
 
-    Edges are the garment's own, or those of a coarse level.
+    With the state there are before them sender's velocity less receiver's 3 [m per frame], strain now, and strain
+    where velocity alone leads: columns that are not normalised stay last. Edges are the garment's own, or those
+    of a coarse level.
     """
-    current = _edge_vectors(edges, inputs.position)
-    rest = _edge_vectors(edges, garment.sewn_positions)
+    now, rest = _edge_vectors(edges, inputs.position), _edge_vectors(edges, garment.sewn_positions)
     constants = material_inputs(garment, material)
-    return jnp.concatenate(
-        [
-            current,
-            safe_norm(current, keepdims=True),
-            rest,
-            safe_norm(rest, keepdims=True),
-            jnp.broadcast_to(inputs.timestep, (current.shape[0], 1)),
-            (constants[edges.senders] + constants[edges.receivers]) / 2,
-        ],
-        axis=1,
-    )
+    rows = [
+        with_norm(now),
+        with_norm(rest),
+        jnp.broadcast_to(inputs.timestep, now.shape[:1]),
+        (constants[edges.senders] + constants[edges.receivers]) / 2,
+    ]
+    if reads_state:
+        moving, rest_length = _edge_vectors(edges, inputs.velocity), safe_norm(rest)
+        rows = [moving, _strain(now, rest_length), _strain(now + moving, rest_length), *rows]
+    return jnp.column_stack(rows)
 
 
-def state_edge_features(
-    garment: Garment, inputs: GraphInputs, edges: Garment | CoarseEdges
-) -> Float[Array, "edges 5"]:
-    """Return sender's velocity less receiver's 3 [m per frame], strain now, and where velocity alone leads."""
-    now, moving = (_edge_vectors(edges, rows) for rows in (inputs.position, inputs.velocity))
-    rest_length = safe_norm(_edge_vectors(edges, garment.sewn_positions), keepdims=True)
-    return jnp.concatenate([moving, _strain(now, rest_length), _strain(now + moving, rest_length)], axis=1)
-
-
-def state_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 2"]:
-    """Return signed distances: from the body point now; from its next plane, of where velocity alone leads."""
-    later = plane_distance(per_world_edge(inputs.position + inputs.velocity, contacts), contacts)
-    return clip(jnp.concatenate([contacts.distances[:, None], later], axis=1) / DISTANCE_SCALE)
-
-
-def hood_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 9"]:
+def hood_world_features(
+    contacts: Contacts, inputs: GraphInputs, *, reads_state: bool
+) -> Float[Array, "world_edges features"]:
     """Return body point minus vertex 3 [m], its norm, the same with the body's next frame 4, timestep [s].
 
-    As on mesh edges, that is sender minus receiver.
+    As on mesh edges, that is sender minus receiver. With the state there are two signed distances behind them:
+    from the body point now; from its next plane, of where velocity alone leads.
     """
-    position = per_world_edge(inputs.position, contacts)
-    now, later = contacts.points - position, contacts.next_points - position
-    return jnp.concatenate(
-        [
-            now,
-            safe_norm(now, keepdims=True),
-            later,
-            safe_norm(later, keepdims=True),
-            jnp.broadcast_to(inputs.timestep, (now.shape[0], 1)),
-        ],
-        axis=1,
-    )
+    position = to_world_edges(inputs.position, contacts.points.shape[0])
+    timestep = jnp.broadcast_to(inputs.timestep, position.shape[:1])
+    rows = [with_norm(contacts.points - position), with_norm(contacts.next_points - position), timestep]
+    if reads_state:
+        later = plane_distance(inputs.position + inputs.velocity, contacts)
+        rows += [clip(distance / DISTANCE_SCALE) for distance in (contacts.distances, later)]
+    return jnp.column_stack(rows)
 
 
 def reverse_world_features(
@@ -277,59 +244,47 @@ def frame_node_features(
     garment: Garment, material: Material, inputs: GraphInputs, edge_length: Float[Array, ""]
 ) -> Float[Array, "vertices 14"]:
     """Return velocity 3, normal 3, timestep, density, vertex area, mesh spacing, pinned, material inputs 3."""
-    num_vertices = inputs.position.shape[0]
-    density = jnp.broadcast_to(material.density, (num_vertices,))
-    area = garment.vertex_areas / edge_length**2
-    scalars = [
-        jnp.broadcast_to(timestep_input(inputs.timestep), (num_vertices,)),
-        jnp.log(density / DENSITY_SCALE),
-        clip(log_positive(area)),
-        jnp.broadcast_to(jnp.log(edge_length / EDGE_LENGTH_SCALE), (num_vertices,)),
-        garment.is_pinned.astype(inputs.position.dtype),
-    ]
-    return jnp.concatenate(
+    rows = inputs.position.shape[:1]
+    return jnp.column_stack(
         [
             clip(inputs.velocity / VELOCITY_SCALE),
             vertex_normals(inputs.position, garment.faces, garment.face_incidence),
-            jnp.stack(scalars, axis=1),
+            jnp.broadcast_to(timestep_input(inputs.timestep), rows),
+            jnp.log(jnp.broadcast_to(material.density, rows) / DENSITY_SCALE),
+            clip(log_positive(garment.vertex_areas / edge_length**2)),
+            jnp.broadcast_to(jnp.log(edge_length / EDGE_LENGTH_SCALE), rows),
+            garment.is_pinned.astype(inputs.position.dtype),
             clip(material_inputs(garment, material)),
-        ],
-        axis=1,
+        ]
     )
 
 
 def refinement_node_features(
-    garment: Garment, material: Material, inputs: GraphInputs, edge_length: Float[Array, ""]
+    garment: Garment, material: Material, inputs: RefinementInputs, edge_length: Float[Array, ""]
 ) -> Float[Array, "vertices 18"]:
     """Return push-out 3, force 4, descent step 4, last correction 3 and last force 4.
 
     A force f enters as its direction times s, and s = asinh(|f| / (m g)) / 2, with g at least
     `LEAST_GRAVITY`. The descent step enters through tanh, in units of a tenth of the mesh spacing, and its
-    size through log1p. The correction and the force of the step before are zero at the first one.
+    size through log1p.
     """
-    guess, gradient = required(inputs, "guess"), required(inputs, "gradient")
-    zeros = jnp.zeros_like(guess)
-    correction = zeros if inputs.correction is None else inputs.correction
-    previous_gradient = zeros if inputs.previous_gradient is None else inputs.previous_gradient
-    mass = vertex_masses(garment, material)
-    weight = jnp.maximum(required(inputs, "weight"), LEAST_GRAVITY * mass)
+    weight = jnp.maximum(inputs.weight, LEAST_GRAVITY * vertex_masses(garment, material))
     unit = jnp.maximum(weight, 1e-12)[:, None]  # a padded vertex has no mass
 
     def force_features(force):
         size = jnp.arcsinh(safe_norm(force, keepdims=True) / unit) / 2
         return safe_normalize(force) * size, size
 
-    scaled = required(inputs, "step") / (STEP_SCALE * edge_length)
-    return jnp.concatenate(
+    scaled = inputs.step / (STEP_SCALE * edge_length)
+    return jnp.column_stack(
         [
-            clip((guess - required(inputs, "inertial_guess")) / GUESS_SCALE),
-            *force_features(-gradient),
+            clip((inputs.guess - inputs.inertial_guess) / GUESS_SCALE),
+            *force_features(-inputs.gradient),
             jnp.tanh(scaled),
-            jnp.log1p(safe_norm(scaled, keepdims=True)) / 2,
-            clip(correction / GUESS_SCALE),
-            *force_features(-previous_gradient),
-        ],
-        axis=1,
+            jnp.log1p(safe_norm(scaled)) / 2,
+            clip(inputs.correction / GUESS_SCALE),
+            *force_features(-inputs.previous_gradient),
+        ]
     )
 
 
@@ -345,15 +300,14 @@ def frame_mesh_features(
     """
     current = _edge_vectors(edges, position)
     rest = _edge_vectors(edges, garment.sewn_positions)
-    rest_length = safe_norm(rest, keepdims=True)
-    return jnp.concatenate(
+    rest_length = safe_norm(rest)
+    return jnp.column_stack(
         [
             clip(current / edge_length),
             clip(rest / edge_length),
             clip(rest_length / edge_length - 1),
             _strain(current, rest_length),
-        ],
-        axis=1,
+        ]
     )
 
 
@@ -364,11 +318,9 @@ def refinement_mesh_features(
     edge_length: Float[Array, ""],
 ) -> Float[Array, "edges 4"]:
     """Return sender minus receiver at the guess 3, in mean lengths, and its strain; see `frame_mesh_features`."""
-    rest = _edge_vectors(edges, garment.sewn_positions)
+    rest_length = safe_norm(_edge_vectors(edges, garment.sewn_positions))
     vector = _edge_vectors(edges, guess)
-    return jnp.concatenate(
-        [clip(vector / edge_length), _strain(vector, safe_norm(rest, keepdims=True))], axis=1
-    )
+    return jnp.column_stack([clip(vector / edge_length), _strain(vector, rest_length)])
 
 
 def _edge_vectors(
@@ -378,59 +330,43 @@ def _edge_vectors(
     return position[edges.senders] - position[edges.receivers]
 
 
-def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, "edges 1"]) -> Float[Array, "edges 1"]:
+def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, " edges"]) -> Float[Array, " edges"]:
     """Return the relative change of length over `STRAIN_SCALE`; zero where padded."""
-    length = safe_norm(vector, keepdims=True)
     is_real = rest_length > 0
-    return clip(jnp.where(is_real, length / jnp.where(is_real, rest_length, 1) - 1, 0) / STRAIN_SCALE)
+    ratio = safe_norm(vector) / jnp.where(is_real, rest_length, 1)
+    return clip(jnp.where(is_real, ratio - 1, 0) / STRAIN_SCALE)
 
 
-def frame_world_features(
-    position: Float[Array, "vertices 3"], contacts: Contacts, inertial_guess: Float[Array, "vertices 3"]
-) -> Float[Array, "world_edges 10"]:
+def frame_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 10"]:
     """Return the offset from the body point now 4 and at the next frame 4, with norms; signed distances 2."""
-    position, inertial_guess = (per_world_edge(rows, contacts) for rows in (position, inertial_guess))
-    now, later = position - contacts.points, position - contacts.next_points
-    return clip(
-        jnp.concatenate(
-            [
-                now / BODY_OFFSET_SCALE,
-                safe_norm(now, keepdims=True) / BODY_OFFSET_SCALE,
-                later / BODY_OFFSET_SCALE,
-                safe_norm(later, keepdims=True) / BODY_OFFSET_SCALE,
-                contacts.distances[:, None] / DISTANCE_SCALE,
-                plane_distance(inertial_guess, contacts) / DISTANCE_SCALE,
-            ],
-            axis=1,
-        )
-    )
+    position = to_world_edges(inputs.position, contacts.points.shape[0])
+    rows = [
+        with_norm(position - contacts.points) / BODY_OFFSET_SCALE,
+        with_norm(position - contacts.next_points) / BODY_OFFSET_SCALE,
+        contacts.distances / DISTANCE_SCALE,
+        plane_distance(inputs.inertial_guess, contacts) / DISTANCE_SCALE,
+    ]
+    return clip(jnp.column_stack(rows))
 
 
 def refinement_world_features(
     guess: Float[Array, "vertices 3"], contacts: Contacts
 ) -> Float[Array, "world_edges 2"]:
     """Return the guess's signed distance to the body's next tangent plane, coarse and in contact widths."""
-    distance = plane_distance(per_world_edge(guess, contacts), contacts)
-    return clip(jnp.concatenate([distance / DISTANCE_SCALE, distance / CONTACT_SCALE], axis=1))
+    distance = plane_distance(guess, contacts)
+    return clip(jnp.column_stack([distance / DISTANCE_SCALE, distance / CONTACT_SCALE]))
 
 
-def plane_distance(
-    position: Float[Array, "world_edges 3"], contacts: Contacts
-) -> Float[Array, "world_edges 1"]:
-    """Return the signed distance [m] to the tangent plane at the body's next frame."""
-    return jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=1, keepdims=True)
+def plane_distance(position: Float[Array, "vertices 3"], contacts: Contacts) -> Float[Array, " world_edges"]:
+    """Return the signed distance [m] of an edge's vertex to the tangent plane at the body's next frame."""
+    position = to_world_edges(position, contacts.points.shape[0])
+    return jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=1)
 
 
-def frame_body_features(
-    velocity: Float[Array, "world_edges 3"], contacts: Contacts, timestep: Float[Array, ""]
-) -> Float[Array, "world_edges 10"]:
+def frame_body_features(contacts: Contacts, timestep: Float[Array, ""]) -> Float[Array, "world_edges 10"]:
     """Return the body point's velocity 3, its normal now 3 and at the next frame 3, and the timestep."""
-    return jnp.concatenate(
-        [
-            clip(velocity / VELOCITY_SCALE),
-            contacts.normals,
-            contacts.next_normals,
-            jnp.broadcast_to(timestep_input(timestep), (velocity.shape[0], 1)),
-        ],
-        axis=1,
+    velocity = contacts.next_points - contacts.points
+    column = jnp.broadcast_to(timestep_input(timestep), velocity.shape[:1])
+    return jnp.column_stack(
+        [clip(velocity / VELOCITY_SCALE), contacts.normals, contacts.next_normals, column]
     )

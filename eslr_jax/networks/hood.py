@@ -19,7 +19,7 @@ Source: Grigorev, Black and Hilliges, "HOOD" (2023); its `models/core/postcvpr.p
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -32,16 +32,9 @@ from eslr_jax.networks.architecture import Architecture, make_decoder, stack, wo
 from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, Rows, feature_sizes, join_features
 from eslr_jax.networks.dense import kernel_spread
 from eslr_jax.networks.eslr import VELOCITY_COLUMNS, GraphModule
-from eslr_jax.networks.lsdmp import WorldLatents, make_mlp
+from eslr_jax.networks.lsdmp import Latents, LayerTables, WorldLatents, make_mlp, pass_messages
 from eslr_jax.networks.network import Statistics, network
-from eslr_jax.networks.operators import (
-    MeshTables,
-    coarse_tables,
-    mesh_tables,
-    sum_receivers,
-    take_receivers,
-    take_senders,
-)
+from eslr_jax.networks.operators import coarse_tables, mesh_tables
 
 STAGES = (
     ("coarse0", "mesh"),
@@ -51,44 +44,6 @@ STAGES = (
     ("coarse0", "mesh"),
 )
 """Edge sets of the stages, in the order in which vertices read their sums (HOOD)."""
-
-
-@network("hood")
-@dataclasses.dataclass(frozen=True)
-class Hood(Architecture):
-    """HOOD's hierarchical network; the defaults are those of the published "postcvpr"."""
-
-    steps_per_stage: int = 3  # layers of each of the five stages
-
-    @property
-    def garment_options(self) -> dict[str, Any]:
-        """Arguments of `assets.load_garment` for a garment that the network reads."""
-        return {"has_coarse_edges": True}
-
-    @property
-    def graph(self) -> GraphKind:
-        """What the network reads of a frame."""
-        return super().graph._replace(has_coarse_edges=True, has_reverse_edges=True)
-
-    @property
-    def module(self) -> HierarchicalNetwork:
-        """The Flax module."""
-        return HierarchicalNetwork(self)
-
-
-class StageLatents(NamedTuple):
-    """What passes from layer to layer of a stage."""
-
-    garment: Float[Array, "vertices latent"]
-    edges: Rows  # by edge set
-    world: WorldLatents | None  # None in a scene without a body
-
-
-class StageTables(NamedTuple):
-    """What is the same in every layer of a stage."""
-
-    edges: dict[str, MeshTables]
-    world_mask: Float[Array, "vertices 1"]  # one where a vertex of the stage's levels has a world edge
 
 
 class HoodLayer(nn.Module):
@@ -104,31 +59,10 @@ class HoodLayer(nn.Module):
         self.world_mlp = make_mlp(self.config, 3 * size)
         self.vertex_mlp = make_mlp(self.config, (2 + len(self.sets)) * size)
 
-    def __call__(self, latents: StageLatents, tables: StageTables):
+    def __call__(self, latents: Latents, tables: LayerTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
-        size, garment, world = self.config.latent_size, latents.garment, latents.world
-        vertex, edges = self.vertex_mlp, dict(latents.edges)
-        hidden = vertex.start(garment, 0, bias=True)
-        for place, name in enumerate(self.sets, 1):
-            edge, table = self.edge_mlps[name], tables.edges[name]
-            ends = take_receivers(edge.start(garment, 0, bias=True), table) + take_senders(
-                edge.start(garment, size), table
-            )
-            messages = edge.finish(edge.start(edges[name], 2 * size) + ends)
-            hidden = hidden + vertex.start(sum_receivers(messages, table), place * size)
-            edges[name] = edges[name] + messages
-        if world is not None and world.reverse is not None:
-            edge, column, mask = self.world_mlp, (1 + len(self.sets)) * size, tables.world_mask
-            ends = edge.start(garment, 0) + edge.start(world.body, size)
-            to_garment = mask * edge.finish(ends + edge.start(world.edges, 2 * size, bias=True))
-            ends = edge.start(world.body, 0) + edge.start(garment, size)
-            to_body = mask * edge.finish(ends + edge.start(world.reverse, 2 * size, bias=True))
-            at_body = vertex.start(world.body, 0, bias=True) + vertex.start(to_body, column)
-            hidden = hidden + vertex.start(to_garment, column)
-            world = WorldLatents(
-                world.body + vertex.finish(at_body), world.edges + to_garment, world.reverse + to_body
-            )
-        return StageLatents(garment + vertex.finish(hidden), edges, world), None
+        edge_mlps = {name: self.edge_mlps[name] for name in self.sets}  # in the order of their columns
+        return pass_messages(edge_mlps, self.world_mlp, self.vertex_mlp, latents, tables), None
 
 
 class HierarchicalNetwork(GraphModule):
@@ -138,41 +72,30 @@ class HierarchicalNetwork(GraphModule):
 
     def setup(self) -> None:
         """Declare embeddings, encoders, stages and decoder."""
-        config, sizes = self.config, feature_sizes(self.config.graph)
-        types = 0 if config.reads_gradient else features.NUM_TYPES
-        if types:
-            self.type_embedding = self.param("type_embedding", kernel_spread(types), (types, types))
-        else:
-            self.body_encoder = make_mlp(config, sizes["body"])
+        config = self.config
+        self.declare_encoders(NUM_LEVELS)
         self.level_embedding = self.param(
             "level_embedding", kernel_spread(NUM_LEVELS), (NUM_LEVELS, NUM_LEVELS)
         )
-        self.garment_encoder = make_mlp(config, sizes["garment"] + types + NUM_LEVELS)
-        self.mesh_encoder = make_mlp(config, sizes["mesh"])
-        self.coarse_encoders = {name: make_mlp(config, sizes["mesh"]) for name in COARSE_SETS}
-        self.world_encoder = make_mlp(config, sizes["world"])
+        columns = feature_sizes(config.graph)["mesh"]
+        self.coarse_encoders = {name: make_mlp(config, columns) for name in COARSE_SETS}
         self.stages = [stack(HoodLayer, config, config.steps_per_stage, sets=sets) for sets in STAGES]
         self.decoder = make_decoder(config)
 
-    def __call__(
-        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
-    ) -> Float[Array, "vertices outputs"]:
-        """Return the raw output for a whole graph; see `EncodeProcessDecode`."""
-        return self.process(graph, places, statistics)
-
-    def encode_frame(self, graph: jraph.GraphsTuple) -> jraph.GraphsTuple:
-        """Return the graph: this network encodes all of it in every refinement step."""
-        return graph
-
-    def encode_refinement(self, encoded: jraph.GraphsTuple, changing: jraph.GraphsTuple) -> jraph.GraphsTuple:
-        """Return the graph with the features of a refinement step; see `EncodeProcessDecode`."""
-        return join_features(encoded, changing)
+    def encode(self, graph: jraph.GraphsTuple, statistics: Statistics) -> jraph.GraphsTuple:
+        """Return the graph with its features as the encoders read them, all of them in every refinement step."""
+        nodes, edges = self.normalized(graph, statistics)
+        return graph._replace(nodes=nodes, edges=edges)
 
     def process(
-        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
+        self, graph: jraph.GraphsTuple, places: Places, changing: jraph.GraphsTuple | None = None
     ) -> Float[Array, "vertices outputs"]:
         """Encode a whole graph, run all stages and decode."""
-        nodes, edges = self.normalized(graph, statistics)
+        graph = graph if changing is None else join_features(graph, changing)
+        nodes, edges = cast(Rows, graph.nodes), cast(Rows, graph.edges)
+        if self.config.reads_gradient:
+            levels = self.level_embedding.astype(nodes["garment"].dtype)[vertex_levels(graph)]
+            nodes = {**nodes, "garment": jnp.concatenate([nodes["garment"], levels], axis=1)}
         vertices = garment = self.garment_encoder(nodes["garment"])
         latents = {name: self.coarse_encoders[name](edges[name]) for name in COARSE_SETS}
         latents["mesh"] = self.mesh_encoder(edges["mesh"])
@@ -188,18 +111,10 @@ class HierarchicalNetwork(GraphModule):
             if "mesh" not in sets:  # which joins all vertices
                 kept = [graph.globals["coarse"][COARSE_SETS.index(name)].is_kept for name in sets]
                 mask = jnp.where(jnp.any(jnp.stack(kept), axis=0)[:, None], mask, 0.0)
-            state = StageLatents(garment, {name: latents[name] for name in sets}, world)
-            state, _ = layers(state, StageTables({name: tables[name] for name in sets}, mask))
+            state = Latents(garment, {name: latents[name] for name in sets}, world)
+            state, _ = layers(state, LayerTables({name: tables[name] for name in sets}, mask))
             garment, world, latents = state.garment, state.world, latents | state.edges
         return self.decoder(garment)
-
-    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
-        """Return node and edge features as the encoders read them, with the embedding of a vertex's level."""
-        nodes, edges = super().normalized(graph, statistics)
-        if not self.config.reads_gradient:
-            return nodes, edges
-        levels = self.level_embedding.astype(nodes["garment"].dtype)[vertex_levels(graph)]
-        return {**nodes, "garment": jnp.concatenate([nodes["garment"], levels], axis=1)}, edges
 
     def with_types(self, graph: jraph.GraphsTuple) -> Rows:
         """Return the node features with the embeddings of vertex type and level behind the velocity."""
@@ -218,3 +133,22 @@ def vertex_levels(graph: jraph.GraphsTuple) -> Int[Array, " vertices"]:
     """Return the coarsest level that every vertex is on; 0 is the mesh."""
     levels = [jnp.where(level.is_kept, k + 1, 0) for k, level in enumerate(graph.globals["coarse"])]
     return jnp.max(jnp.stack(levels), axis=0)
+
+
+@network("hood")
+@dataclasses.dataclass(frozen=True)
+class Hood(Architecture):
+    """HOOD's hierarchical network; the defaults are those of the published "postcvpr"."""
+
+    module_class = HierarchicalNetwork
+    steps_per_stage: int = 3  # layers of each of the five stages
+
+    @property
+    def garment_options(self) -> dict[str, Any]:
+        """Arguments of `assets.load_garment` for a garment that the network reads."""
+        return {"has_coarse_edges": True}
+
+    @property
+    def graph(self) -> GraphKind:
+        """What the network reads of a frame."""
+        return super().graph._replace(has_coarse_edges=True, has_reverse_edges=True)

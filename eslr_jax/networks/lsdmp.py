@@ -5,7 +5,7 @@ garment to body), f_e (`mesh_mlp`, `world_mlp`), f_v (`vertex_mlp`), f'_v (`smoo
 vertex i.
 
 The paper leaves open what follows; the choices are those of MeshGraphNet and HOOD. f_e, f_v and f'_v give
-increments, for edges and vertices alike. N(i) of eq. 3 includes the body point of i's world edge, and every
+increments, for edges and vertices alike. N(i) of eq. 3 includes the body points of i's world edges, and every
 smoothing adds e_ij again. One default differs from HOOD. HOOD updates its body vertices, and garment vertices
 near the same body vertex exchange messages through it. Here every world edge has a body row of its own, which
 could only return its garment vertex's own message. So body rows keep their encoding, and a layer costs a
@@ -17,20 +17,23 @@ Source: paper, eqs. 1-4.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.networks.architecture import Architecture, TwoBranches
+from eslr_jax.networks.build import Rows
 from eslr_jax.networks.dense import MLP
 from eslr_jax.networks.operators import (
     MeshTables,
     sum_neighbors,
     sum_receivers,
+    sum_world_edges,
     take_receivers,
     take_senders,
+    to_world_edges,
 )
 
 
@@ -39,24 +42,24 @@ class WorldLatents(NamedTuple):
 
     body: Float[Array, "world_edges latent"]
     edges: Float[Array, "world_edges latent"]  # from body to garment
-    reverse: (
-        Float[Array, "world_edges latent"] | None
-    )  # from garment to body; None where body rows are constant
+    # From garment to body; None where body rows are constant.
+    reverse: Float[Array, "world_edges latent"] | None
 
 
 class Latents(NamedTuple):
     """What passes from layer to layer."""
 
     garment: Float[Array, "vertices latent"]
-    mesh: Float[Array, "edges latent"]
-    mesh_sum: Float[Array, "vertices latent"]  # of `mesh` over the edges that enter a vertex
-    world: WorldLatents | None = None  # None in a scene without a body
+    edges: Rows  # by edge set
+    world: WorldLatents | None  # None in a scene without a body
+    # Of the mesh's edges that enter a vertex; None where nothing is smoothed.
+    mesh_sum: Float[Array, "vertices latent"] | None = None
 
 
 class LayerTables(NamedTuple):
     """What is the same in every layer."""
 
-    mesh: MeshTables
+    edges: dict[str, MeshTables]
     world_mask: Float[Array, "world_edges 1"]  # one within reach; zeros without a body
 
 
@@ -76,47 +79,10 @@ class LsdmpLayer(nn.Module):
 
     def __call__(self, latents: Latents, tables: LayerTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
-        latents = self.pass_messages(latents, tables)
+        latents = pass_messages({"mesh": self.mesh_mlp}, self.world_mlp, self.vertex_mlp, latents, tables)
         if self.config.smoothing_steps:
             latents = self.smooth(latents, tables)
         return latents, None
-
-    def pass_messages(self, latents: Latents, tables: LayerTables) -> Latents:
-        """Update edges from both ends, then vertices from the sums over their edges.
-
-        e_ij += f_e(v_i, v_j, e_ij) and v_i += f_v(v_i, sum_j f_e^m, sum_j f_e^w). No concatenation is
-        formed: every piece is multiplied by its own rows of the first kernel, vertices before the edges
-        gather them.
-
-        Source: paper, eqs. 1 and 2.
-        """
-        size, garment, world = self.config.latent_size, latents.garment, latents.world
-        edge, vertex = self.mesh_mlp, self.vertex_mlp
-        ends = take_receivers(edge.start(garment, 0, bias=True), tables.mesh) + take_senders(
-            edge.start(garment, size), tables.mesh
-        )  # summed first: one kernel gathers both
-        messages = edge.finish(edge.start(latents.mesh, 2 * size) + ends)
-        message_sum = sum_receivers(messages, tables.mesh)
-        hidden = vertex.start(garment, 0, bias=True) + vertex.start(message_sum, size)
-        if world is not None:
-            edge = self.world_mlp
-            ends = to_world_edges(edge.start(garment, 0), world) + edge.start(world.body, size)
-            to_garment = edge.finish(ends + edge.start(world.edges, 2 * size, bias=True))
-            hidden = hidden + sum_world_edges(vertex.start(to_garment, 2 * size) * tables.world_mask, garment)
-            world = self._pass_to_body(garment, world)._replace(edges=world.edges + to_garment)
-        return Latents(
-            garment + vertex.finish(hidden), latents.mesh + messages, latents.mesh_sum + message_sum, world
-        )
-
-    def _pass_to_body(self, garment: Float[Array, "vertices latent"], world: WorldLatents) -> WorldLatents:
-        """Update reverse world edges and body rows, unless these are constant."""
-        if world.reverse is None:
-            return world
-        size, edge, vertex = self.config.latent_size, self.world_mlp, self.vertex_mlp
-        ends = edge.start(world.body, 0) + to_world_edges(edge.start(garment, size), world)
-        messages = edge.finish(ends + edge.start(world.reverse, 2 * size, bias=True))
-        hidden = vertex.start(world.body, 0, bias=True) + vertex.start(messages, 2 * size)
-        return world._replace(body=world.body + vertex.finish(hidden), reverse=world.reverse + messages)
 
     def smooth(self, latents: Latents, tables: LayerTables) -> Latents:
         """Average over neighbours and their edges a few times, then update the vertices.
@@ -136,18 +102,45 @@ def make_mlp(config: Architecture, input_size: int) -> MLP:
     return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
 
 
-def to_world_edges(
-    rows: Float[Array, "vertices features"], world: WorldLatents
-) -> Float[Array, "world_edges features"]:
-    """Return the row of every world edge's vertex."""
-    return jnp.tile(rows, (world.body.shape[0] // rows.shape[0], 1))
+def pass_messages(
+    edge_mlps: dict[str, MLP], world_mlp: MLP, vertex_mlp: MLP, latents: Latents, tables: LayerTables
+) -> Latents:
+    """Update the edges of some sets and world edges from both ends, then vertices from the sums over their edges.
 
+    e_ij += f_e(v_i, v_j, e_ij) and v_i += f_v(v_i, sum_j f_e set by set, sum_j f_e^w). No concatenation is
+    formed: every piece is multiplied by its own rows of the first kernel, vertices before the edges gather them.
 
-def sum_world_edges(
-    rows: Float[Array, "world_edges features"], garment: Float[Array, "vertices latent"]
-) -> Float[Array, "vertices features"]:
-    """Sum over the world edges of every vertex of the garment."""
-    return jnp.sum(rows.reshape(-1, garment.shape[0], rows.shape[1]), axis=0)
+    Source: paper, eqs. 1 and 2.
+    """
+    garment, edges, world, mesh_sum = latents
+    size = column = garment.shape[1]
+    hidden = vertex_mlp.start(garment, 0, bias=True)
+    for name, mlp in edge_mlps.items():
+        table = tables.edges[name]
+        # Summed before they are added to the edges' part: one kernel gathers both.
+        ends = take_receivers(mlp.start(garment, 0, bias=True), table) + take_senders(
+            mlp.start(garment, size), table
+        )
+        messages = mlp.finish(mlp.start(edges[name], 2 * size) + ends)
+        message_sum = sum_receivers(messages, table)
+        hidden = hidden + vertex_mlp.start(message_sum, column)
+        edges = {**edges, name: edges[name] + messages}
+        if name == "mesh" and mesh_sum is not None:
+            mesh_sum = mesh_sum + message_sum
+        column += size
+    if world is not None:
+        mask, mlp = tables.world_mask, world_mlp
+        ends = to_world_edges(mlp.start(garment, 0), mask.shape[0]) + mlp.start(world.body, size)
+        to_garment = mask * mlp.finish(ends + mlp.start(world.edges, 2 * size, bias=True))
+        hidden = hidden + vertex_mlp.start(sum_world_edges(to_garment, garment.shape[0]), column)
+        body, reverse = world.body, world.reverse
+        if reverse is not None:
+            ends = mlp.start(body, 0) + to_world_edges(mlp.start(garment, size), mask.shape[0])
+            to_body = mask * mlp.finish(ends + mlp.start(reverse, 2 * size, bias=True))
+            at_body = vertex_mlp.start(body, 0, bias=True) + vertex_mlp.start(to_body, column)
+            body, reverse = body + vertex_mlp.finish(at_body), reverse + to_body
+        world = WorldLatents(body, world.edges + to_garment, reverse)
+    return Latents(garment + vertex_mlp.finish(hidden), edges, world, mesh_sum)
 
 
 def propagate(
@@ -163,22 +156,22 @@ def propagate(
 
     Source: paper, eq. 3.
     """
-    garment, world = latents.garment, latents.world
-    degree, edge_sum = tables.mesh.degree, latents.mesh_sum
+    garment, world, mesh, mask = latents.garment, latents.world, tables.edges["mesh"], tables.world_mask
+    degree, edge_sum, count = mesh.degree, cast(Array, latents.mesh_sum), garment.shape[0]
     if world is not None:
-        degree = degree + sum_world_edges(tables.world_mask, garment)
+        degree = degree + sum_world_edges(mask, count)
         arriving = world.edges + world.body if world.reverse is None else world.edges
-        edge_sum = edge_sum + sum_world_edges(arriving * tables.world_mask, garment)
+        edge_sum = edge_sum + sum_world_edges(arriving * mask, count)
     inverse = jnp.where(degree > 0, 1 / jnp.maximum(degree, 1), 0)
     edge_mean = edge_sum * inverse
     body = None
     if world is None or world.reverse is None:
         for _ in range(num_steps):
-            garment = sum_neighbors(garment, tables.mesh) * inverse + edge_mean
+            garment = sum_neighbors(garment, mesh) * inverse + edge_mean
     else:
         body = world.body
         for _ in range(num_steps):
-            total = sum_neighbors(garment, tables.mesh) + sum_world_edges(body * tables.world_mask, garment)
-            body = to_world_edges(garment, world) + world.reverse
+            total = sum_neighbors(garment, mesh) + sum_world_edges(body * mask, count)
+            body = to_world_edges(garment, mask.shape[0]) + world.reverse
             garment = total * inverse + edge_mean
     return jnp.where(degree > 0, garment, latents.garment), body

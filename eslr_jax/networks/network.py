@@ -55,9 +55,7 @@ class System:
     def new_network(self, seed: int, example: Example) -> Network:
         """Return a network with new weights.
 
-        Args:
-            seed: Of the weights.
-            example: Returns a frame's problem and the state before it, from which shapes are read.
+        `example` returns a frame's problem and the state before it, from which shapes are read.
         """
         return Network(self.init(jax.random.key(seed), *example()), self)
 
@@ -81,13 +79,9 @@ class Network:
     constants: dict[str, Any] = struct.field(default_factory=dict)  # random directions of the attention
 
     def predict(self, problem: FrameProblem, state: ClothState, *, detach: bool = False) -> Prediction:
-        """Return the prediction for a frame.
+        """Return the prediction for a frame, with the cloth at t.
 
-        Args:
-            problem: The frame's problem.
-            state: Cloth at t.
-            detach: Refinement steps hand on no gradients: each is then trained to do its best from where it
-                begins.
+        With `detach` refinement steps hand on no gradients: each is trained to do its best from where it begins.
         """
         return self.config.predict(self, problem, state, detach=detach)
 

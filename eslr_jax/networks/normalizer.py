@@ -31,12 +31,7 @@ def init_normalizer(size: int, dtype=jnp.float32) -> Normalizer:
 
 
 def measure(rows: Float[Array, "rows features"], mask: Bool[Array, " rows"] | None = None) -> Normalizer:
-    """Return the statistics of one graph.
-
-    Args:
-        rows: Features, shape [rows, features].
-        mask: Which rows count, shape [rows]; the others may hold any value, also NaN.
-    """
+    """Return the statistics of one graph; rows outside of the mask may hold any value, also NaN."""
     mask = jnp.ones(rows.shape[0], bool) if mask is None else mask
     count = jnp.sum(mask).astype(rows.dtype)
     reference = rows[jnp.argmax(mask)]  # makes the mean of a constant feature exact

@@ -1,4 +1,4 @@
-"""Gathers and sums over the mesh edges of a graph, with backward passes that suit CPU and GPU.
+"""Gathers and sums over the edges of a graph; those of the mesh have backward passes that suit CPU and GPU.
 
 Automatic differentiation turns a gather into a scatter-add. A CPU does that one element at a time, a GPU in an
 order that changes from run to run. A mesh is undirected and its edges are sorted by receiver, so every backward
@@ -23,9 +23,8 @@ class MeshTables(NamedTuple):
     senders: Int[Array, " edges"]
     receivers: Int[Array, " edges"]  # ascending
     reverse_edges: Int[Array, " edges"]  # index of the opposite edge
-    neighbors: Int[
-        Array, "vertices degree"
-    ]  # senders of the incoming edges, padded with the number of vertices
+    # Senders of the incoming edges, padded with the number of vertices.
+    neighbors: Int[Array, "vertices degree"]
     degree: Float[Array, "vertices 1"]  # number of neighbours
 
 
@@ -116,3 +115,17 @@ sum_neighbors.defvjp(
     lambda x, tables: (sum_neighbors(x, tables), tables),
     lambda tables, cotangent: (sum_neighbors(cotangent, tables), None),
 )
+
+
+def to_world_edges(
+    x: Float[Array, "vertices features"], num_edges: int
+) -> Float[Array, "world_edges features"]:
+    """Return the row of every world edge's vertex; see `networks.build` for their order."""
+    return jnp.tile(x, (num_edges // x.shape[0], 1))
+
+
+def sum_world_edges(
+    x: Float[Array, "world_edges features"], num_vertices: int
+) -> Float[Array, "vertices features"]:
+    """Sum over the world edges of every vertex."""
+    return jnp.sum(x.reshape(-1, num_vertices, x.shape[1]), axis=0)

@@ -44,9 +44,5 @@ class Refinement(GatedRefinement, TwoBranches):
     attention_size: int = 32  # q, k, v width, one head
     attention_features: int = 64  # random features
 
+    module_class = EncodeProcessDecode
     is_attention_normed: ClassVar[bool] = True
-
-    @property
-    def module(self) -> EncodeProcessDecode:
-        """The Flax module."""
-        return EncodeProcessDecode(self)

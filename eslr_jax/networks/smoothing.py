@@ -8,7 +8,7 @@ hinges and contacts want. The features of a vertex's world edge and of its body 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -19,39 +19,11 @@ from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
 from eslr_jax.networks.architecture import make_decoder, stack, world_mask
 from eslr_jax.networks.build import feature_sizes
-from eslr_jax.networks.lsdmp import make_mlp
-from eslr_jax.networks.network import network
+from eslr_jax.networks.eslr import GraphModule
+from eslr_jax.networks.lsdmp import LayerTables, make_mlp
+from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.operators import MeshTables, mesh_tables, sum_neighbors
 from eslr_jax.networks.refinement import GatedRefinement
-
-
-@network("smoothing")
-@dataclasses.dataclass(frozen=True)
-class Smoothing(GatedRefinement):
-    """Smoothings without messages; by default one step as the solver's initial guess.
-
-    That costs three to four iterations and saves more.
-    """
-
-    latent_size: int = 32  # a quarter of the paper's
-    remat: Literal["layers", "products", "none"] = "none"  # what a backward pass computes again
-    layers: int = 1  # each a perceptron behind the smoothings
-    smoothing_steps: int = 2  # per layer
-    output: Literal["descent", "subspace"] = "descent"  # sum or best combination of a step's directions
-    refinement_steps: int = 1  # per frame, gradient recomputed between
-
-    @property
-    def module(self) -> nn.Module:
-        """The Flax module."""
-        return SmoothingNetwork(self)
-
-
-class EncodedVertices(NamedTuple):
-    """The encoder's hidden layer, as far as a frame's constant features decide it."""
-
-    hidden: Float[Array, "vertices hidden"]
-    tables: MeshTables
-    world_mask: Float[Array, "vertices 1"]
 
 
 class SmoothingLayer(nn.Module):
@@ -76,8 +48,8 @@ class SmoothingLayer(nn.Module):
         return latents + self.vertex_mlp.finish(hidden), None
 
 
-class SmoothingNetwork(nn.Module):
-    """The whole network, with the methods of `EncodeProcessDecode`."""
+class SmoothingNetwork(GraphModule):
+    """The whole network."""
 
     config: Smoothing
 
@@ -90,13 +62,7 @@ class SmoothingNetwork(nn.Module):
         self.layers = stack(SmoothingLayer, config, config.layers)
         self.decoder = make_decoder(config)
 
-    def __call__(
-        self, graph: jraph.GraphsTuple, places: Places, statistics: object = None
-    ) -> Float[Array, "vertices outputs"]:
-        """Return the raw output for a whole graph; see `EncodeProcessDecode`."""
-        return self.process(self.encode_frame(graph), places)
-
-    def encode_frame(self, graph: jraph.GraphsTuple, statistics: object = None) -> EncodedVertices:
+    def encode(self, graph: jraph.GraphsTuple, statistics: Statistics) -> tuple[Array, LayerTables]:
         """Return the encoder's first layer, for a whole graph or for the features that stay for a frame."""
         nodes = graph.nodes["garment"]
         hidden, mask = self.encoder.start(nodes, 0, bias=True), world_mask(graph, nodes.dtype)
@@ -104,19 +70,38 @@ class SmoothingNetwork(nn.Module):
             rows = self.encoder.start(graph.nodes["body"], self.body_column)
             rows = rows + self.encoder.start(graph.edges["world"], self.world_column)
             hidden = hidden + rows * mask
-        return EncodedVertices(hidden, mesh_tables(graph, nodes.dtype), mask)
+        return hidden, LayerTables({"mesh": mesh_tables(graph, nodes.dtype)}, mask)
 
-    def encode_refinement(self, encoded: EncodedVertices, changing: jraph.GraphsTuple) -> EncodedVertices:
-        """Add the features of a refinement step to those of its frame."""
-        nodes, edges = changing.nodes, changing.edges
-        hidden = encoded.hidden + self.encoder.start(nodes["garment"], features.NODE_FRAME_SIZE)
-        if "world" in edges:
-            rows = self.encoder.start(edges["world"], self.world_column + features.WORLD_FRAME_SIZE)
-            hidden = hidden + rows * encoded.world_mask
-        return encoded._replace(hidden=hidden)
-
-    def process(self, encoded: EncodedVertices, places: Places) -> Float[Array, "vertices outputs"]:
+    def process(
+        self,
+        encoded: tuple[Array, LayerTables],
+        places: Places,
+        changing: jraph.GraphsTuple | None = None,
+    ) -> Float[Array, "vertices outputs"]:
         """Finish the encoder, run the layers and decode."""
-        vertices = self.encoder.finish(encoded.hidden)
-        processed, _ = self.layers(vertices, encoded.tables)
+        hidden, tables = encoded
+        if changing is not None:
+            hidden = hidden + self.encoder.start(changing.nodes["garment"], features.NODE_FRAME_SIZE)
+            if "world" in changing.edges:
+                column = self.world_column + features.WORLD_FRAME_SIZE
+                hidden = hidden + self.encoder.start(changing.edges["world"], column) * tables.world_mask
+        vertices = self.encoder.finish(hidden)
+        processed, _ = self.layers(vertices, tables.edges["mesh"])
         return self.decoder(processed)
+
+
+@network("smoothing")
+@dataclasses.dataclass(frozen=True)
+class Smoothing(GatedRefinement):
+    """Smoothings without messages; by default one step as the solver's initial guess.
+
+    That costs three to four iterations and saves more.
+    """
+
+    module_class = SmoothingNetwork
+    latent_size: int = 32  # a quarter of the paper's
+    remat: Literal["layers", "products", "none"] = "none"  # what a backward pass computes again
+    layers: int = 1  # each a perceptron behind the smoothings
+    smoothing_steps: int = 2  # per layer
+    output: Literal["descent", "subspace"] = "descent"  # sum or best combination of a step's directions
+    refinement_steps: int = 1  # per frame, gradient recomputed between

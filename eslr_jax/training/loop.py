@@ -23,7 +23,7 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, ConfigError, NonFiniteError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
 from eslr_jax.networks.network import Network
-from eslr_jax.networks.weights import write_network
+from eslr_jax.networks.registry import write_network
 from eslr_jax.simulation.interrupt import Interruption
 from eslr_jax.training.checkpoint import (
     Checkpoints,

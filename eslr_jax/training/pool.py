@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -32,29 +34,14 @@ class Slot:
     shape: Float[Array, " shapes"] | None = None
 
 
-def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
+def empty_pool(data: TrainingData, slots_per_garment: int, config: TrainConfig) -> Slot:
     """Return a pool whose slots all start anew at their first use."""
     count = data.num_garments * slots_per_garment
-    vertices = data.garments.rest_positions.shape[1]
-    zeros = jnp.zeros((count, vertices, 3))
-    return Slot(
-        state=ClothState(
-            position=zeros,
-            velocity=jnp.zeros_like(zeros),  # every leaf its own buffer: the state is donated
-            friction_load=jnp.zeros((count, vertices)),
-            frame=jnp.zeros(count, jnp.int32),
-            status=jnp.zeros(count, jnp.int32),
-            first_bad_frame=jnp.full(count, -1, jnp.int32),
-        ),
-        frame=jnp.zeros(count, jnp.int32),
-        before=jnp.zeros(count, jnp.int32),
-        yaw=jnp.zeros(count),
-        girth=jnp.zeros(count),
-        age=jnp.zeros(count, jnp.int32),
-        material=jax.tree.map(lambda leaf: jnp.full(count, leaf, jnp.float32), COTTON),
-        is_done=jnp.ones(count, bool),
-        shape=None if data.shapes is None else jnp.zeros((count, data.shapes.count)),
-    )
+    start = partial(start_trajectory, config=config)
+    slot = jax.eval_shape(start, jax.random.key(0), data, jnp.int32(0))
+    # Every leaf its own buffer: the state is donated.
+    pool = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), slot)
+    return pool.replace(is_done=jnp.ones(count, bool))
 
 
 def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> Slot:

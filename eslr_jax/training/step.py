@@ -23,15 +23,7 @@ from eslr_jax.networks.normalizer import is_warming_up
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.potential import potential_terms
-from eslr_jax.terms import Collision, Contact, Ground, scene_terms
-from eslr_jax.terms.hood import (
-    METRIC_PARAMETERS,
-    BodyFrames,
-    HoodParameters,
-    HoodProblem,
-    collision_weight,
-    hood_terms,
-)
+from eslr_jax.terms import Collision, Contact, Ground, hood, scene_terms
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.training.data import FPS, TrainingData
@@ -87,7 +79,7 @@ def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) ->
     return TrainState(
         network=network,
         optimizer=make_optimizer(config).init(network.params),
-        pools=tuple(map(empty_pool, datasets, slots)),
+        pools=tuple(empty_pool(data, count, config) for data, count in zip(datasets, slots, strict=True)),
         key=jax.random.key_data(jax.random.key(config.seed)),
         step=jnp.int32(0),
         skipped=jnp.int32(0),
@@ -127,10 +119,8 @@ class _Sample(NamedTuple):
 def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = None) -> Callable:
     """Return the jitted step on one resolution's pool: (state, data) -> (state, metrics); state is donated.
 
-    Args:
-        config: The run.
-        resolution: Index of the pool and of the data that the step works on.
-        mesh: Devices to spread the batch over, of `make_mesh`; state and data are on all of them.
+    `resolution` is the index of its pool and data. A batch is spread over the devices of `mesh`, of `make_mesh`;
+    state and data are on all of them.
     """
     everywhere = None if mesh is None else NamedSharding(mesh, PartitionSpec())
 
@@ -357,17 +347,17 @@ def _hood_terms(
 ) -> EnergyTerms:
     """Return HOOD's losses around this frame, with the collision weight of its ramp, or that of its tables."""
     frames = (slot.before, slot.frame, data.next_frame(slot.frame, slot.before))
-    bodies = BodyFrames(
+    bodies = hood.BodyFrames(
         *(data.body(data.transforms(k, slot.yaw, slot.shape), slot.girth, slot.shape) for k in frames),
         data.surface.faces,
     )
-    parameters = METRIC_PARAMETERS
+    parameters = hood.METRIC_PARAMETERS
     if criterion != "metric":
-        parameters = HoodParameters(collision_weight=collision_weight(num_samples))
+        parameters = hood.HoodParameters(collision_weight=hood.collision_weight(num_samples))
     state = slot.state
 
     def terms_of(position, problem: FrameProblem):
-        around = HoodProblem(
+        around = hood.HoodProblem(
             current=state.position,
             previous=state.position - problem.timestep * state.velocity,
             bodies=bodies,
@@ -376,7 +366,7 @@ def _hood_terms(
             timestep=problem.timestep,
             parameters=parameters,
         )
-        return hood_terms(position, around, criterion=criterion)
+        return hood.hood_terms(position, around, criterion=criterion)
 
     return terms_of
 

@@ -24,8 +24,7 @@ from eslr_jax import (
     load_motion,
     pose_body,
 )
-from eslr_jax.networks.registry import MODELS
-from eslr_jax.networks.weights import write_network
+from eslr_jax.networks.registry import MODELS, write_network
 from eslr_jax.pipeline.assets import asset_names, cache, garments, load_garment_file, load_splits
 from eslr_jax.pipeline.assets.cache import (
     cache_folder,

@@ -16,8 +16,7 @@ from eslr_jax import CheckpointError
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.networks.apply import apply_model, scale_output
 from eslr_jax.networks.build import build_graph
-from eslr_jax.networks.registry import MODELS
-from eslr_jax.networks.weights import read_network
+from eslr_jax.networks.registry import MODELS, read_network
 from eslr_jax.pipeline.assets.hood import read_hood
 from eslr_jax.pipeline.formats.torch_archive import read_torch
 

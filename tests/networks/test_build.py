@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from reference_models import make_scene, quick_jit, to_float64
 
+from eslr_jax.networks.apply import graph_inputs
 from eslr_jax.networks.build import GraphKind, build_graph, edge_set, feature_sizes, incoming_edges
 from eslr_jax.networks.features import mean_edge_length
+from eslr_jax.simulation.scene import initial_state
 
 HOOD = GraphKind(reads_gradient=False, has_reverse_edges=True)
 GRADIENT = GraphKind(reads_gradient=True)
@@ -102,7 +104,8 @@ def test_hood_world_features_and_the_rows_beyond_the_radius(scene, hood_graph):
     reverse = np.concatenate([with_norm(-now), with_norm(-later), step], axis=1)
     reverse[~is_close] = 0
     np.testing.assert_allclose(hood_graph.edges["world_reverse"], reverse, atol=1e-6)
-    body = np.concatenate([inputs.body_velocity, contacts.normals, step, -np.ones((len(now), 4))], axis=1)
+    velocity = contacts.next_points - contacts.points
+    body = np.concatenate([velocity, contacts.normals, step, -np.ones((len(now), 4))], axis=1)
     body[~is_close] = 0
     np.testing.assert_allclose(hood_graph.nodes["body"], body, atol=1e-6)
 
@@ -132,12 +135,25 @@ def test_with_the_state_a_vertex_deep_in_the_body_keeps_its_first_world_edge(sce
     garment, material, inputs = scene
     deep = inputs.contacts.replace(distances=jnp.full_like(inputs.contacts.distances, -0.2))
     twice = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), deep)
-    inputs = inputs.replace(contacts=twice, body_velocity=jnp.tile(inputs.body_velocity, (2, 1)))
-    graph = build(STATE._replace(world_edges=2), (garment, material, inputs))
+    graph = build(STATE._replace(world_edges=2), (garment, material, inputs.replace(contacts=twice)))
     first, second = np.asarray(graph.globals["world_mask"]).reshape(2, -1)
     assert first.all()
     assert not second.any()
     np.testing.assert_array_equal(graph.receivers["world"][len(first) :], np.arange(len(first)))
+
+
+def test_the_other_world_edges_lead_to_the_nearest_body_vertices(small_problem):
+    problem, count = small_problem, small_problem.position.shape[0]
+    state = initial_state(problem.position, jnp.zeros_like(problem.position))
+    one, three = (
+        quick_jit(graph_inputs, static_argnums=2)(problem, state, STATE._replace(world_edges=number)).contacts
+        for number in (1, 3)
+    )
+    jax.tree.map(lambda few, many: np.testing.assert_array_equal(few, many[:count]), one, three)
+    position, body, found = (np.asarray(x) for x in (problem.position, problem.body.start, three.points))
+    away = np.sort(np.linalg.norm(position[:, None] - body[None], axis=2), axis=1)
+    found = np.linalg.norm(found.reshape(3, -1, 3) - position, axis=2)
+    np.testing.assert_allclose(found[1:].T, away[:, :2], atol=1e-6)
 
 
 def test_gradient_node_features(scene, gradient_graph):
@@ -215,25 +231,10 @@ def test_jraph_batches_and_unbatches_a_set_of_edges(name, hood_graph):
         jax.tree.map(np.testing.assert_array_equal, part, again)
 
 
-def test_the_first_refinement_step_has_no_correction(scene):
-    garment, material, inputs = scene
-    first = inputs.replace(correction=None, previous_gradient=None)
-    graph = build(GRADIENT, (garment, material, first))
-    np.testing.assert_array_equal(graph.nodes["garment"][:, -7:], 0)
-
-
 def test_forces_keep_their_unit_where_there_is_no_weight(scene):
     garment, material, inputs = scene
     graph = build(GRADIENT, (garment, material, inputs.replace(weight=jnp.zeros_like(inputs.weight))))
     assert np.abs(graph.nodes["garment"]).max() < 10
-
-
-def test_missing_inputs_are_named(scene):
-    garment, material, inputs = scene
-    for name in ("guess", "inertial_guess", "gradient", "step", "weight", "body_velocity"):
-        lacking = (garment, material, inputs.replace(**{name: None}))
-        with pytest.raises(ValueError, match=rf"GraphInputs\.{name}"):
-            jax.eval_shape(lambda *scene: build_graph(*scene, GRADIENT), *lacking)
 
 
 @pytest.mark.parametrize("pad", [False, True])

@@ -13,12 +13,11 @@ import pytest
 from reference_models import make_scene, quick_jit
 
 from eslr_jax import CheckpointError, ConfigError
-from eslr_jax.networks import weights
+from eslr_jax.networks import registry
 from eslr_jax.networks.apply import apply_model, measure_statistics, merge_statistics, scale_output
 from eslr_jax.networks.build import build_graph
 from eslr_jax.networks.network import check_network, describe_system
-from eslr_jax.networks.registry import MODELS, read_system
-from eslr_jax.networks.weights import read_network, write_network
+from eslr_jax.networks.registry import MODELS, read_network, read_system, write_network
 
 COUNTS = {
     "eslr-15": 4_753_108,
@@ -142,7 +141,7 @@ def test_a_network_is_not_there_before_its_description(tmp_path, monkeypatch):
     def killed(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(weights, "write_arrays", killed)
+    monkeypatch.setattr(registry, "write_arrays", killed)
     with pytest.raises(KeyboardInterrupt):
         write_network(tmp_path / "model.npz", new(SMALL), {})
     assert [path.name for path in tmp_path.iterdir()] == ["model.json"]

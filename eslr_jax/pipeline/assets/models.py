@@ -11,7 +11,7 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.errors import AssetError
 from eslr_jax.mesh.prepare import pad_alike
 from eslr_jax.networks.network import Network
-from eslr_jax.networks.weights import read_network
+from eslr_jax.networks.registry import read_network
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path, split_clips
 from eslr_jax.pipeline.assets.garments import load_garment
 from eslr_jax.pipeline.assets.motions import load_body, load_motion

@@ -260,7 +260,7 @@ class Convert:
 
     def __call__(self) -> None:
         """Read the checkpoint and write the network."""
-        from eslr_jax.networks.weights import write_network
+        from eslr_jax.networks.registry import write_network
         from eslr_jax.pipeline.assets.hood import read_hood
 
         check_npz(self.out, "a network")
