@@ -13,7 +13,6 @@ from eslr_jax.types import BodySurface
 # Vertices, faces or edges in a group; more make the first level cheaper and the second dearer.
 _PATCH_SIZE = 16
 
-
 # A part of a body of so many vertices or more is padded, by an eighth at most: then most motions of a garment,
 # which reaches a little more or less of the body in each, share programs; a T-shirt's frame takes 2 % longer.
 _SHARED, _STEPS = 1024, 8

@@ -110,7 +110,7 @@ def moved_incidence(
     num_items: int,
     padded_items: int,
     num_rows: int,
-    degree: int | None = None,
+    degree: int,
 ) -> Int[np.ndarray, "padded_rows padded_degree"]:
     """Return a table of incidence for more rows and items.
 

@@ -189,7 +189,7 @@ def _build(
         joint_transforms=poses.joint_transforms[:2],
         surface=jax.tree.map(jnp.asarray, pad_surface(poses.surface)),
     )
-    given = garment, begin, terms
+    given = garment.replace(material=None), begin, terms
     program = find_program(first_state, given, **starting)
     on_shapes(scene(program.results))
     return scene(program.wait()(*given))
