@@ -15,6 +15,7 @@ from eslr_jax.contact.nearest import (
 from eslr_jax.mesh.closest import closest_points
 from eslr_jax.mesh.surface import pad_surface, prepare_surface
 from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.terms.worn import Worn
 from eslr_jax.types import FAR
 
 find = jax.jit(find_contacts)
@@ -73,6 +74,15 @@ def test_a_padded_body_is_found_as_the_body_itself():
     for name in alone[0].__dataclass_fields__:
         for one, other in zip(alone, beside, strict=True):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["tshirt", "dress"])
+def test_three_motions_of_a_garment_search_bodies_of_two_sizes(body, name):
+    garment, shapes = load_garment(name), set()
+    for motion in ("cmu_016_25", "cmu_016_29", "cmu_069_23"):
+        surface = Worn(garment, pose_body(body, load_motion(motion))).surface
+        shapes.add(tuple(leaf.shape for leaf in jax.tree.leaves(pad_surface(surface))))
+    assert len(shapes) <= 2, shapes
 
 
 def test_contact_point_moves_with_the_body(sphere):
