@@ -31,6 +31,7 @@ _SHEET = tuple(MATERIAL_RANGES)  # numbers of an isotropic sheet
 _STIFFNESS = ("warp_stretch", "weft_stretch", "coupling", "shear")
 _RIGIDITY = ("flexural_rigidity", "warp_rigidity", "weft_rigidity")
 _LIMITS = ("stretch_limit", "warp_limit", "weft_limit")
+_SEAMS = "seams"  # the part of a sewn garment that is the lines along its seams
 _NUMBERS = (*_SHEET, *_STIFFNESS, *_RIGIDITY, *_LIMITS)
 FABRIC_FORMS = "NAME or density=0.2,lame_mu=23600,..., for one part as PART:NAME"
 
@@ -65,7 +66,8 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
             a fabric's name, or numbers such as `density=0.2,lame_mu=23600`: `density` [kg/m^2], `lame_mu` and
             `lame_lambda` [Pa], `bending_stiffness` [J], `thickness` [m]; cotton's value where one is missing.
             In an outfit the name of a garment stands for all its parts. If none is for the whole garment, the
-            rest keeps those in the file, or else is cotton.
+            rest keeps those in the file, or else is cotton. The part `seams` of a garment that was sewn from a
+            pattern is the lines along its seams: they bend as that fabric does.
         garment: Prepared garment.
         stored: Garment file with the parts.
 
@@ -73,13 +75,16 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
         Scalars for one fabric. For several, a value per face (stretch), hinge (bending) and vertex (density).
 
     Raises:
-        ConfigError: A fabric or a part is unknown, or a number is impossible.
+        ConfigError: A fabric or a part is unknown, or a number is impossible; or seams have a fabric, and others
+            bend by flexural rigidity.
     """
-    whole, parts = Described(COTTON, None), {}
+    whole, parts, seams = Described(COTTON, None), {}, None
     for text in worn_fabrics(texts, stored):
         part, separator, rest = text.rpartition(":")
         if not separator:
             whole = describe_fabric(text)
+        elif part == _SEAMS and "sewing" in stored.metadata:
+            seams = describe_fabric(rest).sheet
         elif stored.face_parts is None or not (owned := _parts_of(part, stored)):
             known = ", ".join(stored.part_names) or "none"
             raise ConfigError(f"fabric {text!r}: the garment has no part {part!r}; parts: {known}")
@@ -90,6 +95,8 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
     else:
         sheets = {part: one.sheet for part, one in parts.items()}
         sheet = _mixed(whole.sheet, sheets, np.asarray(stored.face_parts), garment)
+    if seams is not None:
+        sheet = _along_seams(sheet, seams, garment, stored)
     if all(one.weave is None for one in (whole, *parts.values())):
         return sheet
     owners = np.full(int(np.sum(np.asarray(garment.rest_areas) > 0)), -1)
@@ -97,7 +104,21 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
         owners[:] = stored.face_parts
     warp = warp_directions(garment, stored.corner_uvs)
     fabrics = [(np.ones_like(owners, bool), whole), *((owners == part, one) for part, one in parts.items())]
-    return on_threads(sheet, garment, warp, fabrics)
+    woven = on_threads(sheet, garment, warp, fabrics)
+    if seams is not None and woven.plate is not None:
+        raise ConfigError(
+            f"fabric {_SEAMS}: seams bend by bending_stiffness, the garment by flexural rigidity; drop one"
+        )
+    return woven
+
+
+def _along_seams(sheet: Material, seams: Material, garment: Garment, stored: GarmentFile) -> Material:
+    """Return a fabric that along the seams of a garment bends as another one."""
+    bending = np.array(np.broadcast_to(sheet.bending_stiffness, len(garment.hinges)), np.float32)
+    ends = np.asarray(garment.hinges)[:, :2]
+    for vertices in stored.metadata["sewing"]["seams"].values():
+        bending[np.isin(ends, vertices).all(axis=1)] = seams.bending_stiffness
+    return sheet.replace(bending_stiffness=bending)
 
 
 def _parts_of(name: str, stored: GarmentFile) -> list[int]:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from eslr_jax import load_body, load_garment
-from eslr_jax.errors import MeshError
+from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax.fabric.materials import fabric_material
 from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.piercing import piercing_edges
 from eslr_jax.mesh.topology import boundary_loops, vertex_normals
@@ -17,6 +18,7 @@ from eslr_jax.pipeline.assets import prepare_stored
 from eslr_jax.pipeline.assets.garments import MEAN_SHAPE, load_garment_file, sew_pattern_file
 from eslr_jax.pipeline.dressing.outfit import wear_together
 from eslr_jax.pipeline.dressing.panels import join_panels
+from eslr_jax.pipeline.fabrics import garment_material
 from eslr_jax.pipeline.formats.garment import read_garment_npz, write_garment_npz
 from eslr_jax.pipeline.formats.pattern import Seam, read_pattern, signed_area
 from eslr_jax.terms.stretch import principal_stretches
@@ -140,3 +142,20 @@ def test_a_tube_of_one_panel_is_doubted(mean_body, tmp_path):
     (tmp_path / "tube.json").write_text(json.dumps(whole))
     tube = sew_pattern_file(tmp_path / "tube.json", mean_body, num_vertices=150, cache=False)
     assert any("front edge 1 to edge 3 joins a panel to itself" in text for text in tube.fit_warnings)
+
+
+def test_seams_bend_as_their_own_fabric(tshirt):
+    garment = prepare_stored(tshirt, cache=False)
+    material = garment_material(["silk", "seams:bending_stiffness=4e-4"], garment, tshirt)
+    bending, ends = np.asarray(material.bending_stiffness), np.asarray(garment.hinges)[:, :2]
+    is_stiff = bending == np.float32(4e-4)
+    assert (bending[~is_stiff] == fabric_material("silk").bending_stiffness).all()
+    assert material.density == fabric_material("silk").density
+    for vertices in tshirt.metadata["sewing"]["seams"].values():
+        along = np.isin(ends, vertices).all(axis=1)
+        assert is_stiff[along].all()
+        assert along.sum() >= len(vertices) - 2  # a line of them; its ends may lie on the boundary
+    with pytest.raises(ConfigError, match="seams bend by bending_stiffness"):
+        garment_material(["suiting-woven", "seams:denim"], garment, tshirt)
+    with pytest.raises(ConfigError, match="no part 'seams'"):
+        garment_material(["seams:denim"], garment, dataclasses.replace(tshirt, metadata={}))

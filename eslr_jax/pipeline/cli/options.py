@@ -43,7 +43,8 @@ class Options:
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k"
     # Name of a fabric (see `eslr assets --kind fabric`), or numbers as in density=0.2,bending_stiffness=1e-5
     # or flexural_rigidity=5e-6. PART:FABRIC is the fabric of one part or of one garment of an outfit; the
-    # rest keeps its own. By default that of the fitted file, or cotton.
+    # rest keeps its own. Seams of a sewn garment are the part `seams`, whose bending alone counts. By default
+    # that of the fitted file, or cotton.
     fabric: tuple[str, ...] = ()
     # Simulate this many frames, the start included; all if not given.
     frames: int | None = None
