@@ -139,9 +139,6 @@ class Body:
     pose_directions: Float[Array, "body_vertices 3 entries"] | None = None
 
 
-FAR = 1e3  # [m] from the origin along all axes, where padded vertices of a body are
-
-
 @struct.dataclass
 class BodySurface:
     """Part of a body that cloth can touch, with a two-level search structure.

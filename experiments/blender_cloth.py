@@ -39,10 +39,8 @@ from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
 
-BEST = (
-    45,
-    2,
-)  # steps per frame, rounds of collision per step: in peers.json the least gap on its own rollout
+# Steps per frame, rounds of collision per step: in peers.json the least gap on its own rollout.
+BEST = (45, 2)
 SECONDS_PER_FRAME = 1e-3**0.5  # of Blender's cloth, whatever the frame rate
 _BODY_DISTANCE = 1e-3  # [m]; the least that Blender takes
 _SAME = 1e-3  # relative: lengths that count as those at rest

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from eslr_jax.mesh.padding import round_up
 from eslr_jax.mesh.topology import face_areas, incidence_table, moved_incidence, unique_edges, vertex_areas
-from eslr_jax.types import BodySurface
+from eslr_jax.types import BodySurface, Obstacle
 
 # Vertices, faces or edges in a group; more make the first level cheaper and the second dearer.
 _PATCH_SIZE = 16
@@ -16,6 +16,7 @@ _PATCH_SIZE = 16
 # A part of a body of so many vertices or more is padded, by an eighth at most: then most motions of a garment,
 # which reaches a little more or less of it in each, share programs; a T-shirt's frame at 1k takes 4 % longer.
 _SHARED, _STEPS = 1024, 8
+_FAR = 1e3  # [m] from the origin along all axes, where padded vertices of a body are
 
 
 def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.ndarray, "groups size"]:
@@ -67,7 +68,7 @@ def pad_surface(surface: BodySurface) -> BodySurface:
     """Pad a large surface to a number of vertices that others have, with twice the faces and thrice the edges.
 
     Padded faces and edges point at the last vertex. What is padded is in groups of its own, which are far away
-    (`types.FAR`), so no search looks into them. The `vertex_ids` of padded vertices name no vertex of the body.
+    (`pad_body`), so no search looks into them. The `vertex_ids` of padded vertices name no vertex of the body.
 
     Args:
         surface: Of `prepare_surface`.
@@ -103,3 +104,10 @@ def pad_surface(surface: BodySurface) -> BodySurface:
         is_boundary=longer(surface.is_boundary, num_vertices, False),
         vertex_areas=longer(surface.vertex_areas, num_vertices, 0),
     )
+
+
+def pad_body(body: Obstacle) -> Obstacle:
+    """Return a body with a padded surface, see `pad_surface`; padded vertices are far from any cloth."""
+    surface, positions = pad_surface(body.surface), np.asarray(body.positions)
+    added = ((0, 0), (0, len(surface.vertex_ids) - positions.shape[1]), (0, 0))
+    return Obstacle(surface, np.pad(positions, added, constant_values=_FAR))

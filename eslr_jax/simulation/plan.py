@@ -13,13 +13,20 @@ import numpy as np
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.padding import choose_bucket, common_bucket
 from eslr_jax.mesh.prepare import pad_alike
-from eslr_jax.mesh.surface import pad_surface
+from eslr_jax.mesh.surface import pad_body
 from eslr_jax.pose.motion import check_length
 from eslr_jax.simulation.program import find_program
-from eslr_jax.simulation.scene import Integrator, first_state, scene_from, slice_tracks, worn_material
+from eslr_jax.simulation.scene import (
+    Integrator,
+    first_state,
+    reached_body,
+    scene_from,
+    slice_tracks,
+    worn_material,
+)
 from eslr_jax.terms import Term, scene_terms
 from eslr_jax.terms.worn import Worn, looseness, skinned_frames, surface_near, within
-from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
+from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, Scene
 
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 
@@ -178,21 +185,19 @@ def _build(
     **starting: Any,
 ) -> Scene:
     """Return the scene of `build_scene`, whose first state comes from a program that is kept and shared."""
-    garment, poses, material, terms = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
-    pins = skinned_frames(garment, poses.joint_transforms) if has_pins else None
-
-    def scene(start: ClothState) -> Scene:
-        return scene_from(start, garment, poses, material, terms, pin_targets=pins, substeps=substeps)
-
-    begin = poses.replace(
-        positions=poses.positions[:2],
-        joint_transforms=poses.joint_transforms[:2],
-        surface=jax.tree.map(jnp.asarray, pad_surface(poses.surface)),
+    # On the host, where it compiles nothing.
+    body = reached_body(jax.device_get(poses), terms)
+    start = None if body is None else pad_body(body.replace(positions=body.positions[:1]))
+    garment, poses, material, terms, body, start = jax.tree.map(
+        jnp.asarray, (garment, poses, material, terms, body, start)
     )
-    given = garment.replace(material=None), begin, terms
+    given = garment.replace(material=None), poses.joint_transforms[:2], poses.timestep, start, terms
     program = find_program(first_state, given, **starting)
-    on_shapes(scene(program.results))
-    return scene(program.wait()(*given))
+    pins = skinned_frames(garment, poses.joint_transforms) if has_pins else None
+    parts = garment, poses, material, terms
+    scene = scene_from(program.results, *parts, body=body, pin_targets=pins, substeps=substeps)
+    on_shapes(scene)
+    return scene.replace(initial_state=program.wait()(*given))
 
 
 def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:

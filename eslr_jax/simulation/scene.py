@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.terms import Term
-from eslr_jax.types import FAR, BodyMotion, ClothState, Garment, Material, Obstacle, PastState, Scene
+from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Obstacle, PastState, Scene
 
 Integrator = Literal["euler", "bdf2"]
 """Implicit Euler is the paper's, and networks are trained with it. BDF2, of second order, keeps motion alive."""
@@ -39,14 +39,25 @@ def build_scene(
         starts_at_rest: Frame 0 stands still; else it moves as the body does.
         has_pins: Model the garment's pins.
     """
-    start = first_state(garment, poses, terms, integrator=integrator, starts_at_rest=starts_at_rest)
+    body = reached_body(poses, terms)
+    worn = garment, poses.joint_transforms[:2], poses.timestep, body, terms
+    start = first_state(*worn, integrator=integrator, starts_at_rest=starts_at_rest)
     pins = skin_garment(garment, poses.joint_transforms) if has_pins else None
-    return scene_from(start, garment, poses, material, terms, pin_targets=pins, substeps=substeps)
+    return scene_from(start, garment, poses, material, terms, body=body, pin_targets=pins, substeps=substeps)
+
+
+def reached_body(poses: BodyMotion, terms: tuple[Term, ...]) -> Obstacle | None:
+    """Return the part of the body that terms read; None where none does."""
+    if not any(term.reads_body for term in terms):
+        return None
+    return Obstacle(poses.surface, poses.positions[:, poses.surface.vertex_ids])
 
 
 def first_state(
     garment: Garment,
-    poses: BodyMotion,
+    transforms: Float[Array, "2 joints 3 4"],
+    timestep: Float[Array, ""],
+    body: Obstacle | None,
     terms: tuple[Term, ...],
     *,
     integrator: Integrator,
@@ -54,14 +65,20 @@ def first_state(
 ) -> ClothState:
     """Return frame 0: the garment skinned to the first pose, moved out of what the terms forbid.
 
-    The arguments are those of `build_scene`. Of the motion it reads the first two frames.
+    Args:
+        garment: A prepared garment.
+        transforms: Of the joints in the first two frames.
+        timestep: Between them [s].
+        body: Of `reached_body`, whose first frame is read.
+        terms: What to model.
+        integrator: How time is stepped.
+        starts_at_rest: It stands still; else it moves as the body does.
     """
-    skinned = skin_garment(garment, poses.joint_transforms[:2])
-    body = _obstacle(poses, terms)
+    skinned = skin_garment(garment, transforms)
     position = skinned[0]
     for term in terms:
         position = term.start(position, garment, body)
-    velocity = (skinned[1] - skinned[0]) / poses.timestep
+    velocity = (skinned[1] - skinned[0]) / timestep
     if starts_at_rest:
         velocity = jnp.zeros_like(velocity)
     return start_integrator(initial_state(position, velocity), integrator)
@@ -74,6 +91,7 @@ def scene_from(
     material: Material,
     terms: tuple[Term, ...],
     *,
+    body: Obstacle | None,
     pin_targets: Float[Array, "frames vertices 3"] | None,
     substeps: int,
 ) -> Scene:
@@ -84,19 +102,11 @@ def scene_from(
         terms=terms,
         initial_state=start,
         timestep=poses.timestep,
-        body=_obstacle(poses, terms),
+        body=body,
         pin_targets=pin_targets,
         num_frames=poses.joint_transforms.shape[0],
         substeps=substeps,
     )
-
-
-def _obstacle(poses: BodyMotion, terms: tuple[Term, ...]) -> Obstacle | None:
-    """Return the part of the body that terms read; None where none does."""
-    if not any(term.reads_body for term in terms):
-        return None
-    ids = poses.surface.vertex_ids  # of padded vertices there is none
-    return Obstacle(poses.surface, poses.positions.at[:, ids].get(mode="fill", fill_value=FAR))
 
 
 def worn_material(garment: Garment, material: Material | None) -> Material:

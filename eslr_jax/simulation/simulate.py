@@ -14,14 +14,14 @@ from jaxtyping import Array, Int
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
 from eslr_jax.fabric.validate import validate_material, validate_timestep
-from eslr_jax.mesh.surface import pad_surface
+from eslr_jax.mesh.surface import pad_body
 from eslr_jax.networks.network import Network, check_network
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
 from eslr_jax.simulation.scene import initial_state, slice_tracks
 from eslr_jax.simulation.stepper import make_stepper, past_state
-from eslr_jax.types import FAR, ClothState, Scene, Trajectory
+from eslr_jax.types import ClothState, Scene, Trajectory
 
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
@@ -227,14 +227,7 @@ def begin_compiling(
 
 def _share_programs(scene: Scene) -> Scene:
     """Return a scene whose body is padded, so that other motions run the same program (host)."""
-    body = scene.body
-    if body is None:
-        return scene
-    surface, positions = pad_surface(body.surface), np.asarray(body.positions)
-    added = ((0, 0), (0, len(surface.vertex_ids) - positions.shape[1]), (0, 0))
-    return scene.replace(
-        body=body.replace(surface=surface, positions=np.pad(positions, added, constant_values=FAR))
-    )
+    return scene if scene.body is None else scene.replace(body=pad_body(scene.body))
 
 
 def _chunk_of(scene: Scene) -> int:

@@ -13,10 +13,10 @@ from eslr_jax.contact.nearest import (
     nearest_point,
 )
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.surface import pad_surface, prepare_surface
+from eslr_jax.mesh.surface import pad_body, pad_surface, prepare_surface
 from eslr_jax.pipeline.assets import load_splits
 from eslr_jax.terms.worn import Worn
-from eslr_jax.types import FAR
+from eslr_jax.types import Obstacle
 
 find = jax.jit(find_contacts)
 
@@ -59,17 +59,14 @@ def test_signed_distance_normal_and_gate(sphere):
 def test_a_padded_body_is_found_as_the_body_itself():
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.25)
     surface = prepare_surface(mesh.vertices, mesh.faces)
-    padded = pad_surface(surface)
-    extra = len(padded.vertex_ids) - len(surface.vertex_ids)
-    assert extra > 0
-    vertices = np.asarray(mesh.vertices, np.float32)[surface.vertex_ids]
+    body = Obstacle(surface, np.asarray(mesh.vertices, np.float32)[None, surface.vertex_ids])
+    assert pad_body(body).positions.shape[1] > body.positions.shape[1]
     cloth = jnp.asarray(np.random.default_rng(1).uniform(-0.4, 0.4, (200, 3)), jnp.float32)
     alone, beside = (
-        jax.jit(find_both_sides)(cloth, places, 1.1 * places, searched, None, cloth + 0.3)
-        for places, searched in (
-            (vertices, surface),
-            (np.pad(vertices, ((0, extra), (0, 0)), constant_values=FAR), padded),
+        jax.jit(find_both_sides)(
+            cloth, one.positions[0], 1.1 * one.positions[0], one.surface, None, cloth + 0.3
         )
+        for one in (body, pad_body(body))
     )
     for name in alone[0].__dataclass_fields__:
         for one, other in zip(alone, beside, strict=True):

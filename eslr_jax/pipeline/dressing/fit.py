@@ -76,9 +76,8 @@ def fit_garment(
         raise ConfigError(
             f"scale {options.scale} is for a garment of another body; give that body too (eslr fit --made-for)"
         )
-    if options.edge_length is None and (
-        text := describe_cost(len(mesh.positions))
-    ):  # else its size is chosen
+    text = describe_cost(len(mesh.positions))
+    if text and options.edge_length is None:  # else it is remeshed, and its size is chosen
         warnings.warn(text, stacklevel=2)
     worn_by = body if made_for is None else made_for
     clean, report = _clean(mesh.positions, mesh.faces, options)

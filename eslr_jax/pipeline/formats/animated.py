@@ -77,7 +77,8 @@ def check_moving(
     not_finite: type[EslrError] = MeshError,
 ) -> None:
     """Raise a MeshError, or `not_finite`, unless arrays are a mesh over time; see `check_layout`."""
-    arrays, layout = {"positions": positions, "faces": faces}, dict(list(_LAYOUT.items())[:2])
+    arrays = {"positions": positions, "faces": faces}
+    layout = {name: _LAYOUT[name] for name in arrays}
     check_layout(arrays, layout, what=what, remedy=remedy, error=MeshError)
     if 0 in positions.shape or not len(faces):
         raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")

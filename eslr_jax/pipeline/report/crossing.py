@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from eslr_jax.mesh.closest import closest_points
 from eslr_jax.mesh.piercing import piercing_edges
-from eslr_jax.mesh.topology import unique_edges, vertex_components
+from eslr_jax.mesh.topology import undirected_edges, unique_edges, vertex_components
 from eslr_jax.pipeline.extras import require
 
 
@@ -98,11 +98,10 @@ def intersecting_pairs(
     if not np.isfinite(positions).all():
         return np.empty((0, 2), np.int64)
     positions, faces = np.asfortranarray(positions), np.asfortranarray(faces)
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, edge_of_side, counts = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    edges = np.asfortranarray(edges)
-    sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
-    beside = np.split(sides_by_edge % len(faces), np.cumsum(counts)[:-1])  # faces of every edge
+    edges, edge_of_side, counts = undirected_edges(faces)
+    edges = np.asfortranarray(edges, np.int32)
+    sides_by_edge = np.argsort(edge_of_side, kind="stable")
+    beside = np.split(sides_by_edge // 3, np.cumsum(counts)[:-1])  # faces of every edge
     broad = ipctk.LBVH()
     broad.can_vertices_collide = ipctk.make_static_obstacle_filter(len(cloth))
     broad.build(positions, edges, faces, 0.0)
