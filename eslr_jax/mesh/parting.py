@@ -22,7 +22,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.mesh.piercing import piercing_edges
+from eslr_jax.mesh.piercing import close_faces, piercing_edges
 from eslr_jax.mesh.topology import adjacency, face_cross_products, normalize, unique_edges
 
 _GAP = 5e-3  # [m] between two parts: cloth on both sides that keeps two millimetres off, and one to spare
@@ -40,6 +40,7 @@ _KEPT = 0.8  # share of the last frame's yielding that a frame begins with, so t
 _FAST = 0.02  # [m] in a frame, beyond the common way, from which parts may pass each other between frames
 _BETWEEN = (0.25, 0.5)  # shares of a straight way at which its end yields, before the other end does
 _ENOUGH = 2e-4  # [m] of a gap that may be lacking
+_MARGIN = 2e-3  # [m] between faces that are compared; where vertices move by half of it they are found anew
 
 
 def parted(
@@ -85,11 +86,12 @@ def uncrossed(
     So a crease that skinning folds through itself opens. What `_SWEEPS` moves don't free stays crossed.
     """
     mesh, moved = _Mesh(np.asarray(faces), len(points)), np.asarray(points, float)
+    crossing = _Crossing(mesh.faces)
     for _ in range(_SWEEPS):
-        crossing = _crossing(moved, mesh.faces)
-        if not crossing.any():
+        crossed = crossing.at(moved)
+        if not len(crossed):
             break
-        moved = moved + mesh.smoothing(moved, mesh.faces[crossing])
+        moved = moved + mesh.smoothing(moved, crossed)
     return moved.astype(points.dtype)
 
 
@@ -108,6 +110,21 @@ class _Mesh:
         crossed = np.maximum(crossed, 0.5 * (self.neighbors @ crossed > 0))
         mean = (self.neighbors @ points) / self.degrees[:, None]
         return _SMOOTHING * crossed[:, None] * (mean - points)
+
+
+class _Crossing:
+    """Which of some faces cross others, as their vertices move; neighbours don't count."""
+
+    def __init__(self, faces: Int[np.ndarray, "faces 3"]):
+        self.faces = faces
+        self.found_at: np.ndarray | None = None
+
+    def at(self, points: Float[np.ndarray, "vertices 3"]) -> Int[np.ndarray, "crossing 3"]:
+        """Return the faces that cross."""
+        if self.found_at is None or np.max(np.abs(points - self.found_at)) > 0.5 * _MARGIN:
+            self.found_at, self.pairs = points, close_faces(points, self.faces, _MARGIN)
+        owners, _, pierced = piercing_edges(points, self.faces, self.pairs)
+        return self.faces[np.unique(np.concatenate([owners, pierced]))]
 
 
 class _Opposed(NamedTuple):
@@ -130,21 +147,25 @@ class _Body(_Mesh):
         corners = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
         shape = (len(rest), len(faces))
         self.incidence = scipy.sparse.coo_array((np.ones(faces.size), corners), shape).tocsr()
+        self.facing = normalize(self.incidence @ self.normals)
 
     def yielding(
         self, places: Sequence[Float[np.ndarray, "vertices 3"]], yielded: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices 3"]:
         """Return how far every vertex yields [m], at several places alike, from a first guess."""
-        found = [(posed, *self.looked_for(posed)) for posed in places]
+        found = []
+        for posed in places:
+            opposed, folded = self.looked_for(posed)
+            found.append((posed, opposed, _Crossing(self.faces[folded])))
         for _ in range(_SWEEPS):
             before = yielded
-            for posed, opposed, folded in found:
+            for posed, opposed, crossing in found:
                 push = _pushes(posed + yielded, opposed)
                 if push is None:
-                    crossing = _crossing(posed + yielded, self.faces[folded])
-                    if not crossing.any():
+                    crossed = crossing.at(posed + yielded)
+                    if not len(crossed):
                         continue
-                    push = self.smoothing(posed + yielded, self.faces[folded][crossing])
+                    push = self.smoothing(posed + yielded, crossed)
                 yielded = yielded + push
             if yielded is before:
                 break
@@ -159,14 +180,20 @@ class _Body(_Mesh):
         found = cKDTree(posed).sparse_distance_matrix(cKDTree(middles), _AROUND, output_type="ndarray")
         vertex, face = found["i"], found["j"]
         cosine = np.einsum("ij,ij->i", facing[vertex], normals[face])
-        is_kept = cosine < _FOLDED
-        vertex, face, cosine = vertex[is_kept], face[is_kept], cosine[is_kept]
+        is_turned = cosine < _FOLDED
+        vertex, face, cosine = vertex[is_turned], face[is_turned], cosine[is_turned]
+        apart = self.rest[vertex] - self.middles[face]
+        distance = np.linalg.norm(apart, axis=1)
+        # The two sides of a lip, or of a toe, are turned so at rest, where they don't cross.
+        was_turned = np.einsum("ij,ij->i", self.facing[vertex], self.normals[face]) < _FOLDED
+        is_new = (distance > _CREASE[0]) | ~was_turned
+        vertex, face, cosine, apart, distance = (
+            rows[is_new] for rows in (vertex, face, cosine, apart, distance)
+        )
         is_hot = np.zeros(len(posed), bool)
         is_hot[vertex] = True
         folded = is_hot[self.faces].any(axis=1)
         folded[face] = True
-        apart = self.rest[vertex] - self.middles[face]
-        distance = np.linalg.norm(apart, axis=1)
         # The far side of a limb lies behind its near side at rest; what faces it lies before it.
         is_before = np.einsum("ij,ij->i", apart, self.normals[face]) > -5e-3
         is_opposed = (cosine < _TURNED) & is_before & (distance > _CREASE[0])
@@ -200,11 +227,3 @@ def _pushes(points: np.ndarray, opposed: _Opposed) -> np.ndarray | None:
         np.add.at(moves, ids[rows], sign * half)
         np.add.at(weights, ids[rows], lack[rows])
     return moves / np.maximum(weights, 1e-12)[:, None]
-
-
-def _crossing(points: np.ndarray, faces: np.ndarray) -> Bool[np.ndarray, " faces"]:
-    """Return which faces cross another one; neighbours don't count."""
-    owners, _, pierced = piercing_edges(points, faces)
-    is_crossing = np.zeros(len(faces), bool)
-    is_crossing[owners] = is_crossing[pierced] = True
-    return is_crossing

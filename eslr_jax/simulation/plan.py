@@ -26,7 +26,7 @@ from eslr_jax.simulation.scene import (
 )
 from eslr_jax.terms import Term, scene_terms
 from eslr_jax.terms.worn import Worn, looseness, skinned_frames, surface_near, within
-from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, Scene
+from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, Obstacle, Scene
 
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 
@@ -55,6 +55,14 @@ def plan_scene(
         MeshError: The garment hangs on joints that the body does not have.
         ConfigError: A constant of a term is out of its range.
     """
+    planned, poses = _plan(garment, poses, terms, surface)
+    return planned, _cleared(poses, planned)
+
+
+def _plan(
+    garment: Garment, poses: BodyMotion, terms: tuple[Term, ...] | None, surface: BodySurface | None
+) -> tuple[tuple[Term, ...], BodyMotion]:
+    """Do what `plan_scene` does, but leave the body as it moves."""
     _check(garment, poses)
     worn, planned = Worn(garment, poses, surface), []
     for term in scene_terms() if terms is None else terms:
@@ -63,7 +71,7 @@ def plan_scene(
             planned.append(needed)
     if any(term.reads_body for term in planned) and worn.surface is not None:
         poses = poses.replace(surface=worn.surface)
-    return tuple(planned), _cleared(poses, planned)
+    return tuple(planned), poses
 
 
 def prepare_scene(
@@ -100,7 +108,7 @@ def prepare_scene(
         ConfigError: An option has a value that it can't have.
     """
     _check_stepping(integrator, substeps)
-    planned, poses = plan_scene(garment, poses, terms, surface=surface)
+    planned, poses = _plan(garment, poses, terms, surface)
     stepping = {"integrator": integrator, "substeps": substeps, "starts_at_rest": starts_at_rest}
     given = (garment, poses, worn_material(garment, material), planned)
     return _build(*given, on_shapes, **stepping, has_pins=bool(np.any(garment.is_pinned)))
@@ -162,7 +170,7 @@ def prepare_scenes(
     return [
         _build(
             one.garment,
-            _cleared(one.poses if surface is None else one.poses.replace(surface=surface), plan),
+            one.poses if surface is None else one.poses.replace(surface=surface),
             material,
             tuple(plan),
             lambda shapes: None,
@@ -184,20 +192,26 @@ def _build(
     substeps: int,
     **starting: Any,
 ) -> Scene:
-    """Return the scene of `build_scene`, whose first state comes from a program that is kept and shared."""
-    # On the host, where it compiles nothing.
-    body = reached_body(jax.device_get(poses), terms)
-    start = None if body is None else pad_body(body.replace(positions=body.positions[:1]))
-    garment, poses, material, terms, body, start = jax.tree.map(
-        jnp.asarray, (garment, poses, material, terms, body, start)
-    )
-    given = garment.replace(material=None), poses.joint_transforms[:2], poses.timestep, start, terms
+    """Return the scene of `build_scene`, whose first state comes from a program that is kept and shared.
+
+    The body makes room for cloth after `on_shapes`, while programs compile.
+    """
+    poses = jax.device_get(poses)  # on the host nothing is compiled
+
+    def on_body(poses: BodyMotion) -> tuple[Obstacle | None, tuple]:
+        body = reached_body(poses, terms)
+        first = None if body is None else pad_body(body.replace(positions=body.positions[:1]))
+        given = garment.replace(material=None), poses.joint_transforms[:2], poses.timestep, first, terms
+        return body, jax.tree.map(jnp.asarray, given)
+
+    body, given = on_body(poses)
     program = find_program(first_state, given, **starting)
     pins = skinned_frames(garment, poses.joint_transforms) if has_pins else None
-    parts = garment, poses, material, terms
+    parts = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
     scene = scene_from(program.results, *parts, body=body, pin_targets=pins, substeps=substeps)
     on_shapes(scene)
-    return scene.replace(initial_state=program.wait()(*given))
+    body, given = on_body(_cleared(poses, terms))
+    return scene.replace(initial_state=program.wait()(*given), body=jax.tree.map(jnp.asarray, body))
 
 
 def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:

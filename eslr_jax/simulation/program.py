@@ -20,7 +20,7 @@ import jax
 from jax import export
 
 from eslr_jax.files.atomic import atomic_write
-from eslr_jax.files.kept import source_hash, write_kept
+from eslr_jax.files.kept import path_of, source_hash, write_kept
 
 _compiler = ThreadPoolExecutor(1)
 # Programs that are kept in memory. One with self-contact takes 2,700 of the 65,530 memory maps that Linux gives a
@@ -86,15 +86,13 @@ def _program(function: Callable, structure: Any, shapes: tuple, static: tuple, s
         seen.append(jax.tree.structure(results))
         return jax.tree.leaves(results)
 
-    folder = jax.config.jax_compilation_cache_dir
-    # JAX also takes the address of a bucket.
-    if folder is None or "://" in folder or not all(map(_is_known, (function, structure, static))):
-        lowered = jax.jit(flat).lower(*described)
-        return Program(lowered, jax.tree.unflatten(seen[-1], lowered.out_info))
     version = settings, jax.__version__, jax.default_backend()
     key = repr((function.__module__, function.__qualname__, structure, shapes, static, version))
     name = hashlib.sha256(source_hash() + key.encode()).hexdigest()
-    path = Path(folder) / "traced" / f"{name}.pickle"
+    path = path_of("traced", f"{name}.pickle")
+    if path is None or not all(map(_is_known, (function, structure, static))):
+        lowered = jax.jit(flat).lower(*described)
+        return Program(lowered, jax.tree.unflatten(seen[-1], lowered.out_info))
     with contextlib.suppress(Exception):  # missing or damaged: it is traced again
         found, module = pickle.loads(path.read_bytes())  # of the folder from which JAX loads machine code
         exported = export.deserialize(module)

@@ -2,18 +2,19 @@
 
 import itertools
 
+import jax
 import numpy as np
 import pytest
 
 from eslr_jax.mesh.parting import parted, uncrossed
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
+from eslr_jax.terms.worn import Worn, parted_body
 
 
 @pytest.fixture(scope="module")
 def walking(body, tshirt):
     """What a T-shirt reaches of a walking body: arms touch the trunk, and a crease crosses itself."""
     from eslr_jax import load_motion, pose_body
-    from eslr_jax.terms.worn import Worn
 
     poses = pose_body(body, load_motion("cmu_016_32"))
     surface = Worn(tshirt, poses).surface
@@ -35,7 +36,6 @@ def test_a_body_that_crosses_itself_yields_by_millimetres(walking):
 def test_legs_that_pass_each_other_between_two_frames_yield_at_both(body):
     """A kick of 15 cm a frame: at its frames the legs are apart, and on straight ways between them not."""
     from eslr_jax import load_garment, load_motion, pose_body
-    from eslr_jax.terms.worn import Worn
 
     poses = pose_body(body, load_motion("cmu_016_29"), num_frames=32)
     surface = Worn(load_garment("pants", vertices="1k"), poses).surface
@@ -52,6 +52,23 @@ def test_legs_that_pass_each_other_between_two_frames_yield_at_both(body):
     alone = np.concatenate([parted(frame[None], rest, faces) for frame in positions])
     assert max(crossing(alone)) > 50
     assert max(crossing(parted(positions, rest, faces))) == 0
+
+
+def test_a_body_that_made_room_is_kept_beside_compiled_programs(body, tshirt, walk, tmp_path):
+    """Its file is read again; a damaged one is made anew."""
+    surface = Worn(tshirt, walk).surface
+    walk = walk.replace(surface=surface)
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    try:
+        made = parted_body(walk).positions
+        (file,) = (tmp_path / "parted").iterdir()
+        np.savez(file, positions=np.zeros((8, len(surface.vertex_ids), 3), np.float32))
+        assert not parted_body(walk).positions[:, surface.vertex_ids].any()
+        file.write_bytes(b"damaged")
+        np.testing.assert_array_equal(parted_body(walk).positions, made)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_a_body_that_crosses_nothing_stays(walking):

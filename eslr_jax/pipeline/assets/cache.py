@@ -8,19 +8,14 @@ can't be read or written costs time and nothing else.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
 import platformdirs
 
-from eslr_jax.errors import AssetError
-from eslr_jax.files.kept import source_hash, write_kept
-from eslr_jax.files.npz import read_arrays, write_arrays
+from eslr_jax.files import kept
 
 MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
 MAX_COMPILED = 1_000_000_000  # bytes of compiled programs; a scene takes about 3 MB
@@ -39,9 +34,6 @@ _CODE = (
     "numerics.py",
     "types.py",
 )
-
-Value = TypeVar("Value")
-_read_arrays = partial(read_arrays, content="cache")
 
 
 def user_cache() -> Path:
@@ -82,34 +74,9 @@ def trim_folder(folder: Path, most: int = MAX_COMPILED) -> None:
         excess -= size
 
 
-def content_key(*parts: Any) -> str:
-    """Return a hash of arrays, of bytes, and of the `repr` of everything else; a path counts as its name."""
-    digest = hashlib.sha256(source_hash(*_CODE))
-    for part in parts:
-        if isinstance(part, bytes):
-            digest.update(b"b" + len(part).to_bytes(8, "little") + part)
-        elif hasattr(part, "dtype"):
-            array = np.ascontiguousarray(part)
-            digest.update(f"a{array.dtype}{array.shape}".encode() + array.tobytes())
-        else:
-            digest.update(f"r{part!r}".encode())
-    return digest.hexdigest()
+content_key = partial(kept.content_key, _CODE)
 
 
-def cached(
-    key: str,
-    make: Callable[[], Value],
-    *,
-    write: Callable[[Path, Value], None] = write_arrays,
-    read: Callable[[Path], Value] = _read_arrays,
-) -> Value:
-    """Return an entry, named by `content_key`; make and store it if it is missing. By default it holds arrays."""
-    path = cache_folder() / f"{key}.npz"
-    if path.exists():
-        with contextlib.suppress(AssetError, OSError):  # damaged, or just removed: make it again
-            value = read(path)
-            os.utime(path)
-            return value
-    value = make()
-    write_kept(path, lambda path: write(path, value), MAX_ENTRIES)
-    return value
+def cached(key: str, make: Callable[[], kept.Value], **formats: Callable[..., Any]) -> kept.Value:
+    """Return an entry, named by `content_key`; make and store it if it is missing, see `kept.find`."""
+    return kept.find(cache_folder() / f"{key}.npz", make, MAX_ENTRIES, **formats)
