@@ -11,7 +11,7 @@ import difflib
 from eslr_jax.errors import ConfigError
 from hard_cases.bad_mesh import BAD_MESH
 from hard_cases.ball import DROP, START_INSIDE, STEPS_AND_FABRICS, drop_scene
-from hard_cases.case import CaseScene, HardCase, Measure, Outcome, Run, Simulator, run_case
+from hard_cases.case import CaseScene, HardCase, Measure, Outcome, Run, Simulator, run_case, worst
 from hard_cases.free import BAD_START, FREE_FALL, HANG, PULL, TWIST
 from hard_cases.layers import LAYERS
 from hard_cases.limbs import FAST_LIMB, PINCH, TURNED
@@ -39,5 +39,5 @@ def find_case(name: str) -> HardCase:
 
 __all__ = [
     "CASES", "CaseScene", "HardCase", "Measure", "Outcome", "Run",
-    "Simulator", "drop_scene", "find_case", "run_case",
+    "Simulator", "drop_scene", "find_case", "run_case", "worst",
 ]  # fmt: skip
