@@ -41,12 +41,17 @@ class Simulator:
     substeps: int = 1  # of every frame
 
     def prepare(self, scene: Scene, start: int = 0) -> Scene:
-        """Return a case's scene with what this simulator models; every start but 0 is shifted a little."""
+        """Return a case's scene with what this simulator models, from a start of `shifted`."""
         state = start_integrator(scene.initial_state, self.integrator)
-        shift = _SHIFT * np.random.default_rng(start).uniform(-1.0, 1.0, state.position.shape)
-        is_free = np.asarray(scene.garment.vertex_mask & ~scene.garment.is_pinned)[:, None]
-        position = state.position + np.where(is_free & (start > 0), shift, 0.0).astype(np.float32)
-        return scene.replace(initial_state=state.replace(position=position), substeps=self.substeps)
+        return shifted(scene.replace(initial_state=state, substeps=self.substeps), start)
+
+
+def shifted(scene: Scene, start: int) -> Scene:
+    """Return a scene whose cloth begins a little beside its first state; start 0 is that state."""
+    shift = _SHIFT * np.random.default_rng(start).uniform(-1.0, 1.0, scene.initial_state.position.shape)
+    is_moved = np.asarray(scene.garment.vertex_mask & ~scene.garment.is_pinned)[:, None] & (start > 0)
+    position = scene.initial_state.position + np.where(is_moved, shift, 0.0).astype(np.float32)
+    return scene.replace(initial_state=scene.initial_state.replace(position=position))
 
 
 def solver_simulator(
