@@ -1,4 +1,4 @@
-"""Count what passes through what: garments and outfits on clips, from starts that differ by a hundredth of a millimetre.
+"""Count what passes through what: garments and outfits on clips, from starts that differ by 0.01 mm.
 
     python experiments/contact.py [--starts 10] [--worn dress pants+tshirt] [--clip cmu_016_29] [--vertices 1k]
     python experiments/contact.py --smoke --out DIR
@@ -6,7 +6,7 @@
 All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every third
 frame a referee counts pairs of triangles that intersect, of cloth with the body and of cloth with cloth. A start
 fails where there is one, where the simulator let something through, or where a frame ends with a force of 20
-weights. An outfit is written from the inside outwards; `underskirt` and `skirt` are the dress from the waist down.
+weights. An outfit is written from the inside outwards; a `skirt` and an `underskirt` are a dress without its top.
 
 Rows of contact.json stay until they are measured again.
 """

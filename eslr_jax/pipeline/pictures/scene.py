@@ -20,7 +20,7 @@ from eslr_jax.pipeline.pictures.camera import Camera
 
 _VARIANT = "scalar_rgb"
 # Direct light only: at equal time a third of the noise of a path tracer, and folds keep their contrast.
-_LIGHT_SAMPLES = 4  # per camera ray
+_LIGHT_SAMPLES = 3  # per camera ray; four take a quarter longer, and are off by 0.7 in place of 0.8 of 255
 _BACKGROUND = (0.86, 0.87, 0.88)  # sRGB; the lit floor has the same colour, so no horizon shows
 _SKY_RADIANCE = np.array([0.20, 0.21, 0.23])  # the fill; radiances are scaled so that 1 is white
 _SKY_SHARE = 0.25  # of the light samples
