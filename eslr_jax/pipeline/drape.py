@@ -5,6 +5,7 @@ Source: Cusick 1968, doi 10.1080/00405006808659985; ISO 9073-9: a disc of 30 cm,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from eslr_jax.mesh.prepare import prepare_garment
 from eslr_jax.pipeline.fabrics import Described, describe_fabric, on_threads
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.scene import initial_state
-from eslr_jax.terms import CLOTH
+from eslr_jax.terms import CLOTH, Gravity
 from eslr_jax.types import Scene
 
 DISC, TABLE = 0.15, 0.09  # radii [m]
@@ -107,15 +108,21 @@ def _settle(scene: Scene, config: SimConfig) -> tuple[jax.Array, jax.Array, jax.
 
 
 def hang(
-    described: Described, *, spacing: float = SPACING, start: int = 0, frames: int = _MOST_FRAMES
+    described: Described,
+    *,
+    spacing: float = SPACING,
+    start: int = 0,
+    frames: int = _MOST_FRAMES,
+    lowering: Sequence[float] = (1.0,),
 ) -> Hung:
-    """Lay a disc of a fabric over the table and let go of its rim.
+    """Lay a disc of a fabric over the table and let go of its rim, at once or slowly.
 
     Args:
         described: Fabric, of `describe_fabric`; its warp runs along z.
         spacing: Of the edges [m].
         start: Starts differ by a micrometre, as by rounding; which folds form differs with them.
-        frames: At most, of 1/15 s.
+        frames: At most, of 1/15 s, in each part of `lowering`.
+        lowering: Shares of gravity, one after the other; with each the disc comes to rest.
     """
     flat, faces = disc(spacing)
     ones = np.ones((len(flat), 1))
@@ -143,12 +150,16 @@ def hang(
         terms=CLOTH,
         num_frames=length,
     )
-    end, velocity, speed = _settle(scene, _SOLVED)
-    for _ in range(length, frames, length - 1):
-        if speed < _AT_REST:
-            break
-        end, velocity, speed = _settle(scene.replace(initial_state=initial_state(end, velocity)), _SOLVED)
-    return Hung(np.asarray(end), flat, faces, float(speed))
+    state, speed = scene.initial_state, np.inf
+    for share in lowering:
+        weight = Gravity(share * Gravity().acceleration)
+        terms = tuple(weight if isinstance(term, Gravity) else term for term in CLOTH)
+        for _ in range(0, frames - 1, length - 1):
+            end, velocity, speed = _settle(scene.replace(initial_state=state, terms=terms), _SOLVED)
+            state = initial_state(end, velocity)
+            if speed < _AT_REST:
+                break
+    return Hung(np.asarray(state.position), flat, faces, float(speed))
 
 
 class Fitted(NamedTuple):

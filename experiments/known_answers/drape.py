@@ -19,6 +19,8 @@ JUDGED = (
 _STARTS = 20
 _FINE = (0.016, 0.008, 0.005)  # spacings besides the usual [m]
 _FINE_STARTS = 3
+_SLOWLY = (0.1, 0.4, 0.7, 1.0)  # of gravity; six steps end within a hundredth of these four
+_SLOW_STARTS = 6
 
 
 class Drape(NamedTuple):
@@ -26,6 +28,7 @@ class Drape(NamedTuple):
 
     fabric: str
     spacing: float  # [m]
+    is_slow: bool  # its rim is let down slowly, not at once
     starts: int
     median: float  # share of the rim's area that the shadow still covers
     least: float
@@ -41,18 +44,23 @@ def drapes(is_smoke: bool) -> Iterator[tuple[Drape, Hung]]:
         return
     for fabric in (*JUDGED, *(name for name in all_fabrics() if name not in JUDGED)):
         yield drape(fabric, starts=_STARTS if fabric in JUDGED else _FINE_STARTS)
+    for fabric in JUDGED:
+        yield drape(fabric, starts=_SLOW_STARTS, is_slow=True)
     for spacing in _FINE:
         for fabric in JUDGED:
             yield drape(fabric, starts=_FINE_STARTS, spacing=spacing)
 
 
-def drape(fabric: str, *, starts: int, spacing: float = SPACING, **more: int) -> tuple[Drape, Hung]:
+def drape(
+    fabric: str, *, starts: int, spacing: float = SPACING, is_slow: bool = False, **more: int
+) -> tuple[Drape, Hung]:
     """Measure how a fabric hangs in a number of starts; the other arguments are those of `hang`."""
-    hung = [hang(describe_fabric(fabric), spacing=spacing, start=start, **more) for start in range(starts)]
+    options = {"spacing": spacing, "lowering": _SLOWLY if is_slow else (1.0,), **more}
+    hung = [hang(describe_fabric(fabric), start=start, **options) for start in range(starts)]
     shares = np.array([one.coefficient for one in hung])
     fastest = 1e3 * max(one.speed for one in hung)
     spread = (float(np.median(shares)), float(shares.min()), float(shares.max()))
-    return Drape(fabric, spacing, starts, *spread, _folds(hung[0]), fastest), hung[0]
+    return Drape(fabric, spacing, is_slow, starts, *spread, _folds(hung[0]), fastest), hung[0]
 
 
 def _folds(hung: Hung) -> int:
