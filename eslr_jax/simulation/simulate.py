@@ -118,7 +118,7 @@ def _in_chunks(
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
     # The last chunk goes on beyond the last frame, and what it simulates there is dropped: all stands still.
     held = np.minimum(np.arange(scene.num_frames + chunk), total)
-    shared = _share_programs(jax.device_get(scene))  # on the host, where it compiles nothing
+    shared = share_programs(jax.device_get(scene))  # on the host, where it compiles nothing
     inputs = frame_inputs(slice_tracks(shared, held))
     constant = jax.tree.map(jnp.asarray, _without_frames(shared))
 
@@ -222,10 +222,10 @@ def begin_compiling(
         bound = jnp.int32(0) if is_paced else None
         return params, _without_frames(scene), scene.initial_state, inputs, bound
 
-    find_program(_scan, jax.eval_shape(first_chunk, params, _share_programs(scene)), config=config).begin()
+    find_program(_scan, jax.eval_shape(first_chunk, params, share_programs(scene)), config=config).begin()
 
 
-def _share_programs(scene: Scene) -> Scene:
+def share_programs(scene: Scene) -> Scene:
     """Return a scene whose body is padded, so that other motions run the same program (host)."""
     return scene if scene.body is None else scene.replace(body=pad_body(scene.body))
 

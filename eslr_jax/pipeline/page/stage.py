@@ -16,6 +16,7 @@ from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import step_frame
+from eslr_jax.simulation.simulate import share_programs
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.terms import Air, Elements, Term, scene_terms
 from eslr_jax.terms.problem import FrameProblem
@@ -77,10 +78,10 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
         return stage.constant, scene.initial_state, frame, jnp.int32(0), jnp.float32(0.0)
 
     def begin(scene: Scene) -> None:
-        find_program(_step, jax.eval_shape(first_step, scene), config=_CONFIG).begin()
+        find_program(_step, jax.eval_shape(first_step, share_programs(scene)), config=_CONFIG).begin()
 
     scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
-    return _staged(scene, material)
+    return _staged(share_programs(scene), material)
 
 
 def _staged(scene: Scene, material: Material) -> Stage:
