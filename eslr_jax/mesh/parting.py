@@ -7,7 +7,7 @@ there and cross nothing. So the body that cloth touches yields by a few millimet
 2. Where faces cross still, at creases, their vertices move towards their neighbours'.
 
 Legs that pass each other within a frame may be apart at both its ends, and cross on straight ways between them.
-So a fast body yields for places beside its frames, too.
+So a fast body yields for places beside its frames, too, and then for what still crosses on its ways.
 
 Source: Ando 2024, doi 10.1145/3687908, for a body that yields; the way it does so here is the project's own.
 """
@@ -39,6 +39,9 @@ _SMOOTHING = 0.3  # share of the way to the neighbours' mean, at a time
 _KEPT = 0.8  # share of the last frame's yielding that a frame begins with, so that it changes gently
 _FAST = 0.02  # [m] in a frame, beyond the common way, from which parts may pass each other between frames
 _BETWEEN = (0.25, 0.5)  # shares of a straight way at which its end yields, before the other end does
+_ALONG = np.arange(8) / 8  # shares of a fast way at which it is looked at again
+_UNLIKE = 2e-3  # [m] that its ends yield unlike; less does not close a gap
+_TURNS = 4  # of that, at most
 _ENOUGH = 2e-4  # [m] of a gap that may be lacking
 _MARGIN = 2e-3  # [m] between faces that are compared; where vertices move by half of it they are found anew
 
@@ -60,11 +63,12 @@ def parted(
     # With the faces around them: these bound how far the others give way.
     is_near = np.isin(faces, np.unique(faces[is_near])).any(axis=1)
     ids, corners = np.unique(faces[is_near], return_inverse=True)
-    part, yielded = _Body(rest[ids], corners.reshape(-1, 3)), np.zeros((len(ids), 3))
-    reached = positions[:, ids]
+    part, reached = _Body(rest[ids], corners.reshape(-1, 3)), positions[:, ids]
+    yields = np.zeros((len(positions), len(ids), 3))
     for frame in range(len(positions)):
-        yielded = part.yielding(_places(reached, frame), _KEPT * yielded)
-        out[frame, ids] += yielded.astype(out.dtype)
+        yields[frame] = part.yielding(_places(reached, frame), _KEPT * yields[frame - 1])
+    part.open_ways(reached, yields)
+    out[:, ids] += yields.astype(out.dtype)
     return out
 
 
@@ -72,10 +76,15 @@ def _places(positions: Float[np.ndarray, "frames vertices 3"], frame: int) -> li
     """Return where a body is at a frame and next to it [m]: a limb that passes another yields at both ends."""
     here, places = positions[frame], [positions[frame]]
     for other in positions[max(frame - 1, 0) : frame + 2]:
-        way = other - here
-        if np.max(np.linalg.norm(way - way.mean(axis=0), axis=1)) > _FAST:
-            places += [here + share * way for share in _BETWEEN]
+        if _is_fast(here, other):
+            places += [here + share * (other - here) for share in _BETWEEN]
     return places
+
+
+def _is_fast(here: Float[np.ndarray, "vertices 3"], there: Float[np.ndarray, "vertices 3"]) -> bool:
+    """Tell whether parts of a body may pass each other on the straight ways between two frames."""
+    way = there - here
+    return float(np.max(np.linalg.norm(way - way.mean(axis=0), axis=1))) > _FAST
 
 
 def uncrossed(
@@ -170,6 +179,26 @@ class _Body(_Mesh):
             if yielded is before:
                 break
         return yielded
+
+    def open_ways(
+        self,
+        reached: Float[np.ndarray, "frames vertices 3"],
+        yields: Float[np.ndarray, "frames vertices 3"],
+    ) -> None:
+        """Let the ends of a fast way yield alike where faces still cross on it, because they yielded unlike."""
+        unlike = np.linalg.norm(np.diff(yields, axis=0), axis=2).max(axis=1, initial=0.0)
+        ways = {way for way in np.flatnonzero(unlike > _UNLIKE) if _is_fast(*reached[way : way + 2])}
+        for _ in range(_TURNS):
+            changed = set()
+            for way in sorted(ways):
+                for share in _ALONG:
+                    mixed = np.array([1.0 - share, share])
+                    posed, own = (np.tensordot(mixed, of[way : way + 2], 1) for of in (reached, yields))
+                    _, folded = self.looked_for(posed)
+                    if len(_Crossing(self.faces[folded]).at(posed + own)):
+                        yields[way : way + 2] += self.yielding([posed], own) - own
+                        changed |= {way - 1, way, way + 1}
+            ways &= changed
 
     def looked_for(
         self, posed: Float[np.ndarray, "vertices 3"]
