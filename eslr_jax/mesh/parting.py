@@ -14,7 +14,9 @@ Source: Ando 2024, doi 10.1145/3687908, for a body that yields; the way it does 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -50,14 +52,11 @@ def parted(
     positions: Float[np.ndarray, "frames vertices 3"],
     rest: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
-    every: int = 1,
 ) -> Float[np.ndarray, "frames vertices 3"]:
-    """Return the positions of a body whose parts have been pushed apart [m].
-
-    At rest nothing crosses. Every so many frames one is searched whole; between them only what came near in any.
-    """
+    """Return the positions of a body whose parts have been pushed apart [m]; at rest nothing crosses."""
     positions, whole, out = np.asarray(positions), _Body(rest, faces), np.array(positions)
-    is_near = np.any([whole.looked_for(posed)[1] for posed in positions[::every]], axis=0)
+    # What is near in any place is looked at in all.
+    is_near = np.any([whole.looked_for(posed)[1] for posed in _sampled(positions)], axis=0)
     if not is_near.any():
         return out
     # With the faces around them: these bound how far the others give way.
@@ -72,19 +71,30 @@ def parted(
     return out
 
 
+def _sampled(positions: Float[np.ndarray, "frames vertices 3"]) -> Iterator[np.ndarray]:
+    """Yield where a body is [m], so often that no part of it passes another unseen."""
+    last = positions[0]
+    yield last
+    for here, there in itertools.pairwise(positions):
+        if _spread(last, there) > 2 * _AROUND:
+            count = math.ceil(_spread(here, there) / (2 * _AROUND))
+            yield from (here + share * (there - here) for share in np.arange(1, count + 1) / count)
+            last = there
+
+
 def _places(positions: Float[np.ndarray, "frames vertices 3"], frame: int) -> list[np.ndarray]:
     """Return where a body is at a frame and next to it [m]: a limb that passes another yields at both ends."""
     here, places = positions[frame], [positions[frame]]
     for other in positions[max(frame - 1, 0) : frame + 2]:
-        if _is_fast(here, other):
+        if _spread(here, other) > _FAST:
             places += [here + share * (other - here) for share in _BETWEEN]
     return places
 
 
-def _is_fast(here: Float[np.ndarray, "vertices 3"], there: Float[np.ndarray, "vertices 3"]) -> bool:
-    """Tell whether parts of a body may pass each other on the straight ways between two frames."""
+def _spread(here: Float[np.ndarray, "vertices 3"], there: Float[np.ndarray, "vertices 3"]) -> float:
+    """Return how far a part of a body moves at most, beyond the common way [m]."""
     way = there - here
-    return float(np.max(np.linalg.norm(way - way.mean(axis=0), axis=1))) > _FAST
+    return float(np.max(np.linalg.norm(way - way.mean(axis=0), axis=1)))
 
 
 def uncrossed(
@@ -187,7 +197,7 @@ class _Body(_Mesh):
     ) -> None:
         """Let the ends of a fast way yield alike where faces still cross on it, because they yielded unlike."""
         unlike = np.linalg.norm(np.diff(yields, axis=0), axis=2).max(axis=1, initial=0.0)
-        ways = {way for way in np.flatnonzero(unlike > _UNLIKE) if _is_fast(*reached[way : way + 2])}
+        ways = {way for way in np.flatnonzero(unlike > _UNLIKE) if _spread(*reached[way : way + 2]) > _FAST}
         for _ in range(_TURNS):
             changed = set()
             for way in sorted(ways):

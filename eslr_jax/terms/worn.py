@@ -140,8 +140,7 @@ def parted_body(poses: BodyMotion) -> BodyMotion:
         return poses
     ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
     positions = np.array(poses.positions)
-    every = max(round(_SPACING / float(poses.timestep)), 1)
-    given = positions[:, ids], np.asarray(poses.rest_positions)[ids], faces, every
+    given = positions[:, ids], np.asarray(poses.rest_positions)[ids], faces
     path = kept.path_of("parted", kept.content_key(("mesh", "numerics.py"), *given) + ".npz")
     positions[:, ids] = kept.find(path, lambda: {"positions": parted(*given)}, _KEPT)["positions"]
     return poses.replace(positions=positions)
