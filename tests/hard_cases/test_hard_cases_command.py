@@ -84,7 +84,7 @@ def test_sheet_shows_every_case(outcome):
 
 
 @pytest.mark.parametrize(("words", "option"), [
-    (("corrected", "--integrator", "bdf2", "--substeps", "2"), "--integrator, --substeps"),
+    (("corrected", "--integrator", "euler", "--substeps", "2"), "--integrator, --substeps"),
     (("physics", "--model", "smooth-small"), "--model"),
 ])  # fmt: skip
 def test_options_of_another_simulator_are_refused(tmp_path, words, option):
