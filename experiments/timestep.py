@@ -45,11 +45,6 @@ def make_scenes(garments: list[Any], motions: list[Any]) -> list[Scene]:
     return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths))
 
 
-def begun(scene: Scene, integrator: Integrator) -> Scene:
-    """Return a scene that is stepped by an integrator."""
-    return scene.replace(initial_state=start_integrator(scene.initial_state, integrator))
-
-
 def measure_time(
     garments: Sequence[str], vertices: Any, clips: Sequence[str], is_smoke: bool
 ) -> Iterator[dict]:
@@ -69,8 +64,8 @@ def measure_time(
 
     def run(integrator: Integrator, steps: int) -> Iterator[tuple[np.ndarray, float | None]]:
         for scene, start in zip(posed(steps), starts, strict=True):
-            ready = begun(scene, integrator)
-            ready = ready.replace(initial_state=ready.initial_state.replace(position=start))
+            state = start_integrator(scene.initial_state.replace(position=start), integrator)
+            ready = scene.replace(initial_state=state)
             began = time.process_time()
             done = simulate(None, ready, config=FINE)
             took = 1e3 * (time.process_time() - began) / (frames - 1)

@@ -42,8 +42,8 @@ _KEPT = 0.8  # share of the last frame's yielding that a frame begins with, so t
 _FAST = 0.02  # [m] in a frame, beyond the common way, from which parts may pass each other between frames
 _BETWEEN = (0.25, 0.5)  # shares of a straight way at which its end yields, before the other end does
 _ALONG = np.arange(8) / 8  # shares of a fast way at which it is looked at again
-_UNLIKE = 2e-3  # [m] that its ends yield unlike; less does not close a gap
 _TURNS = 4  # of that, at most
+_UNLIKE = 2e-3  # [m] that the ends of a way yield unlike; less does not close a gap
 _ENOUGH = 2e-4  # [m] of a gap that may be lacking
 _MARGIN = 2e-3  # [m] between faces that are compared; where vertices move by half of it they are found anew
 

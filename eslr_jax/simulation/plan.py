@@ -197,6 +197,8 @@ def _build(
     The body makes room for cloth after `on_shapes`, while programs compile.
     """
     poses = jax.device_get(poses)  # on the host nothing is compiled
+    garment, material, terms = jax.tree.map(jnp.asarray, (garment, material, terms))
+    poses = poses.replace(timestep=jnp.asarray(poses.timestep))
 
     def on_body(poses: BodyMotion) -> tuple[Obstacle | None, tuple]:
         body = reached_body(poses, terms)
@@ -207,7 +209,7 @@ def _build(
     body, given = on_body(poses)
     program = find_program(first_state, given, **starting)
     pins = skinned_frames(garment, poses.joint_transforms) if has_pins else None
-    parts = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
+    parts = garment, poses, material, terms
     scene = scene_from(program.results, *parts, body=body, pin_targets=pins, substeps=substeps)
     on_shapes(scene)
     body, given = on_body(_cleared(poses, terms))
