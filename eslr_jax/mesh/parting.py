@@ -38,7 +38,7 @@ _FOLDED = 0.2  # cosine between normals, below which faces may cross
 _SWEEPS = 40  # of pushes; ten are enough for most frames
 _SHARE = 0.8  # of a push that is done at a time
 _SMOOTHING = 0.3  # share of the way to the neighbours' mean, at a time
-_KEPT = 0.8  # share of the last frame's yielding that a frame begins with, so that it changes gently
+_KEPT = 0.8  # share of what the frames beside it yield that a frame yields too, so that cloth is moved gently
 _FAST = 0.02  # [m] in a frame, beyond the common way, from which parts may pass each other between frames
 _BETWEEN = (0.25, 0.5)  # shares of a straight way at which its end yields, before the other end does
 _ALONG = np.arange(8) / 8  # shares of a fast way at which it is looked at again
@@ -66,6 +66,8 @@ def parted(
     yields = np.zeros((len(positions), len(ids), 3))
     for frame in range(len(positions)):
         yields[frame] = part.yielding(_places(reached, frame), _KEPT * yields[frame - 1])
+    for frame in reversed(range(len(positions) - 1)):
+        yields[frame] = _longer(yields[frame], _KEPT * yields[frame + 1])
     part.open_ways(reached, yields)
     out[:, ids] += yields.astype(out.dtype)
     return out
@@ -239,6 +241,12 @@ class _Body(_Mesh):
         vertex, face, distance = vertex[is_opposed], face[is_opposed], distance[is_opposed]
         gaps = np.minimum(_GAP, _CREASE[1] * (distance - _CREASE_START))
         return _Opposed(vertex, self.faces[face], normals[face], sizes[face], gaps), folded
+
+
+def _longer(one: Float[np.ndarray, "rows 3"], other: Float[np.ndarray, "rows 3"]) -> np.ndarray:
+    """Return the longer of two vectors, row by row."""
+    is_longer = np.einsum("ij,ij->i", one, one) >= np.einsum("ij,ij->i", other, other)
+    return np.where(is_longer[:, None], one, other)
 
 
 def _middles_and_normals(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -54,6 +54,14 @@ def test_legs_that_pass_each_other_between_two_frames_yield_at_both(body):
     assert max(crossing(parted(positions, rest, faces))) == 0
 
 
+def test_a_body_begins_to_yield_before_it_has_to(walking):
+    """Five still frames without a crossing, then one that crosses: what it yields is asked of the frames before."""
+    positions, rest, faces = walking
+    frames = np.concatenate([np.repeat(rest[None], 5, axis=0), positions[:1]])
+    yielded = np.linalg.norm(parted(frames, rest, faces) - frames, axis=2).max(axis=1)
+    np.testing.assert_allclose(yielded[:5], yielded[5] * 0.8 ** np.arange(5, 0, -1), rtol=1e-2)
+
+
 def test_a_body_that_made_room_is_kept_beside_compiled_programs(body, tshirt, walk, tmp_path):
     """Its file is read again; a damaged one is made anew."""
     surface = Worn(tshirt, walk).surface
