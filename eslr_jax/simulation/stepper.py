@@ -17,8 +17,8 @@ from eslr_jax.networks.network import Network, Prediction
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.lbfgs import Minimum
-from eslr_jax.solver.potential import Point, contact_load, evaluate, potential_terms
-from eslr_jax.solver.solve import MOST_RESIDUAL, Start, lower_point, solve
+from eslr_jax.solver.potential import Point, contact_load, corrected, evaluate, potential_terms
+from eslr_jax.solver.solve import MOST_RESIDUAL, Start, lower_point, solve_frame
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
 
@@ -72,7 +72,7 @@ def make_stepper(
         if config.iterations or iterations is not None:
             # A minimum does not depend on where the solver began, and neither do its derivatives.
             start, status = find_start(*jax.lax.stop_gradient((network, problem, state)))
-            minimum = solve(
+            minimum, data = solve_frame(
                 problem,
                 start,
                 iterations=config.iterations if iterations is None else iterations,
@@ -87,31 +87,22 @@ def make_stepper(
                 )
             point, _, status = _begin(network, problem, state)
             unknown = jnp.full_like(point.value, jnp.inf)
-            minimum = Minimum(*point, iterations=jnp.int32(0), gap_bound=unknown)
-        position, problem = corrected(problem, pin(problem, minimum.position))
+            position, data = corrected(point.position, problem)
+            minimum = Minimum(position, *point[1:], iterations=jnp.int32(0), gap_bound=unknown)
+        position, ended = pin(problem, minimum.position), problem.replace(data=data)
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
             energies=potential_terms(position, problem),
             residual=residual,
             iterations=minimum.iterations,
             gap_bound=minimum.gap_bound,
-            demands=buffer_demands(problem),
-            is_passed=any_passed(problem),
+            demands=buffer_demands(ended),
+            is_passed=any_passed(ended),
         )
-        return next_state(position, problem, state, status | minimum.status, residual), report
+        status = status | minimum.status | terms_status(ended)
+        return next_state(position, problem, state, status, residual), report
 
     return step
-
-
-def corrected(
-    problem: FrameProblem, position: Float[Array, "vertices 3"]
-) -> tuple[Float[Array, "vertices 3"], FrameProblem]:
-    """Return positions at t + 1 [m] as the terms let the frame end, and the problem with what came of it."""
-    data = []
-    for term, own in problem.parts:
-        position, own = term.correct(position, problem, own)
-        data.append(own)
-    return position, problem.replace(data=tuple(data))
 
 
 def find_start(
@@ -174,9 +165,7 @@ def next_state(
     # A network moves padding too; with its speed carried on it would come to look like thrown cloth.
     position = jnp.where(problem.garment.vertex_mask[:, None], position, problem.position)
     # A gradient that is not finite stops the solver where it began, at positions that are.
-    status = state.status | status
-    for term, data in problem.parts:  # such as too small a buffer or too fast a body
-        status = status | term.status(problem, data)
+    status = state.status | status | terms_status(problem)
     status = status | _finiteness(position) | _finiteness(jnp.asarray(residual))
     frame = state.frame + 1
     return ClothState(
@@ -188,6 +177,12 @@ def next_state(
         first_bad_frame=jnp.where((state.status == 0) & (status != 0), frame, state.first_bad_frame),
         past=None if state.past is None else past_state(state, problem.timestep, residual),
     )
+
+
+def terms_status(problem: FrameProblem) -> Int[Array, ""]:
+    """Return the status bits of a frame's terms, such as too small a buffer or too fast a body."""
+    bits = (term.status(problem, data) for term, data in problem.parts)
+    return functools.reduce(jnp.bitwise_or, bits, jnp.int32(Status.OK))
 
 
 def past_state(

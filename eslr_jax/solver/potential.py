@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,3 +58,14 @@ def contact_load(position: Float[Array, "vertices 3"], problem: FrameProblem) ->
     """
     loads = (term.load(position, problem, data) for term, data in problem.parts)
     return sum(loads, jnp.zeros(position.shape[0], position.dtype))
+
+
+def corrected(
+    position: Float[Array, "vertices 3"], problem: FrameProblem
+) -> tuple[Float[Array, "vertices 3"], tuple[Any, ...]]:
+    """Return positions at t + 1 [m] as the terms let the frame end, and the terms' data with what came of it."""
+    position, ended = pin(problem, position), []
+    for term, data in problem.parts:
+        position, data = term.correct(position, problem, data)
+        ended.append(data)
+    return position, tuple(ended)

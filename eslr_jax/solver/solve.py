@@ -10,6 +10,8 @@ Source: Griewank and Walther 2008, Evaluating Derivatives, section 15 (implicit 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,9 +24,9 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
-from eslr_jax.solver.lbfgs import Minimum, Stop, minimize
+from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
 from eslr_jax.solver.minres import LinearSolution, solve_symmetric
-from eslr_jax.solver.potential import Point, potential
+from eslr_jax.solver.potential import Point, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 
@@ -38,6 +40,8 @@ _REFUSED = 0.1
 _LINEAR_STOP = {"float32": (1e-4, 500), "float64": (1e-9, 3000)}
 _LINEAR_STALL = 1e-2  # residual above which the derivative is refused
 
+
+_PASSES = 3  # of a frame that is solved and corrected, at most
 
 # [weights] Force with which a frame is not yet solved, whatever its tolerance, and which BDF2 does not carry on.
 # Within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15.
@@ -56,6 +60,13 @@ def lower_point(reached: Point, previous: Point) -> Point:
     """Return the lower of two points; the previous one where they are level, the other where one is NaN."""
     is_lower = (reached.value < previous.value) | jnp.isnan(previous.value)
     return jax.tree.map(lambda new, old: jnp.where(is_lower, new, old), reached, previous)
+
+
+class Solved(NamedTuple):
+    """How a frame ends."""
+
+    minimum: Minimum  # with positions as the terms corrected them
+    data: tuple[Any, ...]  # of the terms, with what came of it; it has no derivative
 
 
 def solve(
@@ -84,20 +95,81 @@ def solve(
     Raises:
         ConfigError: The number of iterations is not an integer, as where somebody differentiates by it.
     """
+    return _solve(problem, *_checked(start, iterations, tolerance), memory, False).minimum
+
+
+def solve_frame(
+    problem: FrameProblem,
+    start: Start,
+    *,
+    iterations: int | Int[Array, ""],
+    tolerance: float | Float[Array, ""] = 0.0,
+    memory: int = 8,
+) -> Solved:
+    """Solve a frame, and let its terms correct where it ends (`Term.correct`).
+
+    Where they move cloth far, the cloth around knows nothing of it. Then the frame is solved once more from
+    there, with their new data. Arguments and derivatives are those of `solve`; these take no notice of
+    corrections.
+    """
+    return _solve(problem, *_checked(start, iterations, tolerance), memory, True)
+
+
+def _checked(start: Start, iterations: Any, tolerance: Any) -> tuple[Start, tuple[Array, Array]]:
     iterations = jnp.asarray(iterations)
     if not jnp.issubdtype(iterations.dtype, jnp.integer):
         raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
-    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance, start.inertial_energy.dtype))
-    return _solve(problem, jax.lax.stop_gradient(start), limits, memory)
+    limits = iterations, jnp.asarray(tolerance, start.inertial_energy.dtype)
+    return jax.lax.stop_gradient((start, limits))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
+@partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def _solve(
-    problem: FrameProblem, start: Start, limits: tuple[Int[Array, ""], Float[Array, ""]], memory: int
-) -> Minimum:
+    problem: FrameProblem,
+    start: Start,
+    limits: tuple[Int[Array, ""], Float[Array, ""]],
+    memory: int,
+    is_corrected: bool,
+) -> Solved:
     most_force = MOST_RESIDUAL * weight_norm(problem)
     stop = Stop(*limits, start.inertial_energy, most_force=most_force)
-    return _minimum(problem, start, stop, memory)
+    if not is_corrected:
+        return Solved(_minimum(problem, start, stop, memory), problem.data)
+
+    def any_of(found: Iterator[Any]) -> Array:
+        return functools.reduce(jnp.logical_or, found, jnp.zeros((), bool))
+
+    def is_passed(data: tuple[Any, ...]) -> Array:
+        found = (term.is_passed(own) for term, own in zip(problem.terms, data, strict=True))
+        return any_of(one for one in found if one is not None)
+
+    def is_going(carry: tuple[Solved, Array]) -> Array:
+        (_, data), count = carry
+        is_far = any_of(term.is_far(own) for term, own in zip(problem.terms, data, strict=True))
+        return (count == 0) | ((count < _PASSES) & is_far)
+
+    def once(carry: tuple[Solved, Array]) -> tuple[Solved, Array]:
+        last, count = carry
+        now = problem.replace(data=last.data)
+        begin = start._replace(position=last.minimum.position)
+        if start.previous is not None:  # a step of the first pass; no step of the others
+            unknown = unknown_point(begin.position)
+            known = jax.tree.map(lambda a, b: jnp.where(count == 0, a, b), start.previous, unknown)
+            begin = begin._replace(previous=known)
+        minimum = _minimum(now, begin, stop, memory)
+        spent = last.minimum.iterations + minimum.iterations
+        position, data = corrected(minimum.position, now)
+        solved = Solved(minimum._replace(position=position, iterations=spent), data)
+        # What can't be reached without letting something through is no end for a frame that has another one.
+        is_worse = (count > 0) & is_passed(data) & ~is_passed(last.data)
+        kept = jax.tree.map(lambda old, new: jnp.where(is_worse, old, new), last, solved)
+        return kept, jnp.where(is_worse, _PASSES, count + 1)
+
+    nothing = jnp.zeros_like(start.position)
+    unknown = jnp.zeros_like(start.inertial_energy)
+    first = Minimum(start.position, unknown, nothing, jnp.int32(0), unknown, jnp.int32(0))
+    data = jax.tree.map(jnp.asarray, problem.data)
+    return jax.lax.while_loop(is_going, once, (Solved(first, data), jnp.int32(0)))[0]
 
 
 def _minimum(problem: FrameProblem, start: Start, stop: Stop, memory: int) -> Minimum:
@@ -112,7 +184,7 @@ def _minimum(problem: FrameProblem, start: Start, stop: Stop, memory: int) -> Mi
 
 
 @_solve.defjvp
-def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, Any]:
+def _solve_jvp(memory: int, is_corrected: bool, primals: tuple, tangents: tuple) -> tuple[Solved, Any]:
     """Solve to rest, and move the minimum by one linear system.
 
     A tolerance of 1 % of the gap is enough for motion, and far too little for a derivative: there the Hessian is
@@ -137,9 +209,19 @@ def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, A
     move = -_solve_hessian_linear(problem, position, force_change)
     move = jnp.where(is_refused, jnp.nan, 1.0) * move
     value_change = value_change + jnp.sum(minimum.gradient * move)
-    fixed = np.zeros((), jax.dtypes.float0)
-    zeros = jax.tree.map(jnp.zeros_like, (minimum.gradient, minimum.gap_bound))
-    return minimum, Minimum(move, value_change, zeros[0], fixed, zeros[1], fixed)  # type: ignore[arg-type]
+    data = jax.tree.map(jnp.asarray, problem.data)
+    if is_corrected:
+        ended, data = jax.lax.stop_gradient(corrected(position, problem))
+        minimum = minimum._replace(position=ended)
+    solved = Solved(minimum, data)
+    still = jax.tree.map(_no_change, solved)
+    return solved, still._replace(minimum=still.minimum._replace(position=move, value=value_change))
+
+
+def _no_change(value: Array) -> Any:
+    """Return the zero tangent of a value."""
+    is_real = jnp.issubdtype(value.dtype, jnp.inexact)
+    return jnp.zeros_like(value) if is_real else np.zeros(value.shape, jax.dtypes.float0)
 
 
 def _solve_hessian_linear(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lists import Motion, find_pairs, joint_meshes
 from eslr_jax.contact.nearest import clear_of_body
-from eslr_jax.contact.pairs import CHUNK, Rows, closest, corners_of
+from eslr_jax.contact.pairs import CHUNK, Met, closest, corners_of
 from eslr_jax.contact.ways import Moved, move_clear
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, components, dot3, segment_sum, sub3, vertex_normals
@@ -48,14 +48,23 @@ def starting_rows(num_vertices: int) -> int:
     return CHUNK * math.ceil(_ROWS * num_vertices / CHUNK)
 
 
+def _friction(problem: FrameProblem) -> Friction:
+    """Return the friction of the scene; without one nothing rubs."""
+    return next((term for term in problem.terms if isinstance(term, Friction)), Friction(coefficient=0.0))
+
+
 def keeps_layers(scene: Scene) -> bool:
     """Tell whether a scene keeps cloth from passing through cloth."""
     contact = scene.term(Contact)
     return contact is not None and contact.has_layers
 
 
+Corners = tuple[Vector3, ...]
+"""The four vertices of every pair, by components [m]."""
+
+
 class NearPairs(NamedTuple):
-    """Pairs that are near each other at a frame's start, and the direction that parts them there."""
+    """Pairs that are near each other at t, or meet later, and the direction that parts them there."""
 
     # Of the cloth. Where a corner is the body's, a vertex of the pair's cloth with the weight zero.
     vertices: Int[Array, "corners rows"]
@@ -89,8 +98,9 @@ def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3])
 class Ends(NamedTuple):
     """What came of a frame's ends."""
 
-    is_passed: Bool[Array, ""]
-    most: Int[Array, ""]  # rows that the fullest table would have needed
+    is_passed: Bool[Array, ""] | bool = False
+    most: Int[Array, ""] | int = 0  # rows that the fullest table would have needed
+    is_far: Bool[Array, ""] | bool = False  # one was pushed by `ways.FAR`
 
 
 class Meetings(NamedTuple):
@@ -99,7 +109,7 @@ class Meetings(NamedTuple):
     near: NearPairs
     most_near: Int[Array, ""]  # that the fuller table of them would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
-    ends: Ends | None = None  # None before the frame has ended
+    ends: Ends = Ends()
 
 
 @struct.dataclass
@@ -112,8 +122,10 @@ class Contact(Term):
 
     An energy can be overcome, and pairs that come near within the frame have none. So the positions that the
     frame would end with are pushed until no pair has met on the straight ways from the frame's start. Cloth that
-    starts uncrossed stays so. The body yields where its own parts pass through each other (`mesh.parting`).
-    Where that does not make room, something is let through, and the trajectory says in which frame.
+    starts uncrossed stays so. Where ends are pushed far, pairs that met on the way get the energy too, along the
+    direction that parted them last, and the frame is solved once more. The body yields where its own parts pass
+    through each other (`mesh.parting`). Where that does not make room, something is let through, and the
+    trajectory says in which frame.
 
     A derivative takes no notice of the pushes.
 
@@ -194,58 +206,59 @@ class Contact(Term):
         meshes = joint_meshes(garment, None if body is None else body.surface, has_layers=self.has_layers)
         motion = jax.lax.stop_gradient(Motion(x, still, radius))
         found = find_pairs(motion, meshes, self._near_rows(count))
-        rubbed = next(
-            (term for term in problem.terms if isinstance(term, Friction)), Friction(coefficient=0.0)
-        )
-        kinds = [
-            self._near(x, y, rows, is_edge, problem, rubbed.coefficient)
-            for rows, is_edge in found.pairs.kinds
-        ]
+        kinds = []
+        for rows, is_edge in found.pairs.kinds:
+            here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
+            kinds.append(self._near(rows.ids, rows.count, is_edge, here, here, there, problem))
         near = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *kinds)
-        return Meetings(near, found.most, rubbed.slip(problem))
+        return Meetings(near, found.most, _friction(problem).slip(problem))
 
     def _near(
         self,
-        x: Vector3,
-        y: Vector3,
-        rows: Rows,
+        ids: Int[Array, "corners rows"],
+        count: Int[Array, ""],
         is_edge: bool,
+        start: Corners,
+        there: Corners,
+        end: Corners,
         problem: FrameProblem,
-        coefficient: Array | float,
+        *,
+        is_met: bool = False,
     ) -> NearPairs:
-        """Return pairs of one kind, from all vertices at t, and at t with the body at t + 1.
+        """Return pairs from their vertices at t, where the normal between them is taken, and at t + 1.
 
-        `coefficient` is that of friction.
+        At t + 1 it is the body's that are read. `is_met` are pairs that are far from each other at t.
         """
-        areas, ids = problem.garment.vertex_areas, rows.ids
+        areas = problem.garment.vertex_areas
         is_cloth = ids < len(areas)
-        near = closest(corners_of(x, ids), is_edge)
+        near = closest(there, is_edge)
         weights = jnp.stack(near.weights)
-        others, of_body = corners_of(y, ids), jnp.where(is_cloth, 0.0, weights)
+        of_body = jnp.where(is_cloth, 0.0, weights)
         # Corners of the cloth stand in for those of the body: a first primitive's, or else a second one's.
         vertices = jnp.where(is_cloth, ids, jnp.where(is_cloth[0], ids[0], ids[3]))
         own = jnp.where(is_cloth, weights, 0.0)
         sides = jnp.sum(jnp.abs(own), axis=0)  # that are cloth, one or two
         area = jnp.sum(jnp.abs(own) * areas[vertices], axis=0) / jnp.maximum(sides, 1.0)
-        # A vertex over the body is `Collision`'s. Where a pair is nearest on the rim, the normal leans, and would
-        # stand in the way of what slides: its neighbours hold it.
+        # Where a pair is nearest on the rim, the normal leans, and would stand in the way of what slides: its
+        # neighbours hold it.
         is_counted = jnp.min(jnp.abs(weights), axis=0) > _RIM
-        if not is_edge:
+        if not (is_edge or is_met):  # a vertex over the body is `Collision`'s, which knows what is near at t
             is_counted = is_counted & ~(is_cloth[0] & ~is_cloth[1])
-        is_counted = is_counted & (jnp.arange(ids.shape[1]) < rows.count)
+        is_counted = is_counted & (jnp.arange(ids.shape[1]) < count)
         stiffness = self.stiffness * contact_excess(problem.material) * area
         near_pairs = NearPairs(
             vertices=vertices,
             weights=own,
-            base=_weighted(of_body, others),
-            start=near.offset,
+            base=_weighted(of_body, end),
+            start=_weighted(weights, start),
             normal=near.normal,
             thickness=self.thickness * jnp.maximum(sides, 1.0),
             stiffness=jnp.where(is_counted, stiffness, 0.0),
             rubbing=jnp.zeros_like(area),
         )
-        depth = near_pairs.depths(near.offset)
-        return near_pairs._replace(rubbing=coefficient * 3.0 * near_pairs.stiffness * depth * depth)
+        depth = near_pairs.depths(near_pairs.start)
+        rubbing = _friction(problem).coefficient * 3.0 * near_pairs.stiffness * depth * depth
+        return near_pairs._replace(rubbing=rubbing)
 
     def push_out(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Meetings
@@ -285,12 +298,47 @@ class Contact(Term):
             surface = None if body is None else body.surface
             meshes = joint_meshes(garment, surface, has_layers=self.has_layers)
             return move_clear(
-                start, position.T - start, *ways, meshes, is_free, self._num_rows(len(position))
+                start,
+                position.T - start,
+                *ways,
+                meshes,
+                is_free,
+                self._num_rows(len(position)),
+                self._near_rows(len(position)),
             )
 
         ended = moved(*jax.lax.stop_gradient((position, problem)))
         pushed = ended.position.T - jax.lax.stop_gradient(position)
-        return position + pushed, data._replace(ends=Ends(ended.is_passed, ended.most))
+        is_far = ended.met[0].count + ended.met[1].count > 0
+        near = jax.lax.cond(
+            is_far,
+            lambda: jax.lax.stop_gradient(self._with_met(data.near, ended.met, position, problem)),
+            lambda: jax.lax.stop_gradient(data.near),
+        )
+        return position + pushed, data._replace(near=near, ends=Ends(ended.is_passed, ended.most, is_far))
+
+    def _with_met(
+        self,
+        near: NearPairs,
+        met: tuple[Met, Met],
+        position: Float[Array, "vertices 3"],
+        problem: FrameProblem,
+    ) -> NearPairs:
+        """Return near pairs and those that cloth would meet on its way, as far as the table holds them."""
+        start, end = problem.position, position
+        if problem.body is not None:
+            start = jnp.concatenate([start, problem.body.start])
+            end = jnp.concatenate([end, problem.body.end])
+        for (ids, share, count), is_edge in zip(met, (False, True), strict=True):
+            here, there = corners_of(components(start), ids), corners_of(components(end), ids)
+            parted = jax.tree.map(lambda a, b, share=share: (1.0 - share) * a + share * b, here, there)
+            more = self._near(ids, count, is_edge, here, parted, there, problem, is_met=True)
+            size = near.stiffness.shape[0]
+            (unused,) = jnp.nonzero(near.stiffness == 0, size=ids.shape[1], fill_value=size)
+            near = jax.tree.map(
+                lambda old, new, unused=unused: old.at[..., unused].set(new, mode="drop"), near, more
+            )
+        return near
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Meetings) -> tuple[Elements, ...]:
         """Return the energy of every near pair [J].
@@ -315,19 +363,21 @@ class Contact(Term):
     def status(self, problem: FrameProblem, data: Meetings) -> Int[Array, ""]:
         """Return whether a table was too small."""
         count = len(problem.position)
-        is_full = data.most_near > self._near_rows(count)
-        if data.ends is not None:
-            is_full = is_full | (data.ends.most > self._num_rows(count))
+        is_full = (data.most_near > self._near_rows(count)) | (data.ends.most > self._num_rows(count))
         return jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
 
     def is_passed(self, data: Meetings) -> Bool[Array, ""] | None:
         """Return whether something was let through."""
-        return None if data.ends is None else data.ends.is_passed
+        return jnp.asarray(data.ends.is_passed)
+
+    def is_far(self, data: Meetings) -> Bool[Array, ""] | bool:
+        """Return whether an end was pushed so far that cloth around it has to follow."""
+        return data.ends.is_far
 
     def demand(self, data: Meetings) -> Int[Array, ""]:
         """Return the rows that the fullest search asked for."""
         near = jnp.where(data.most_near > _LEAST_NEAR, _NEAR_SHARE * data.most_near, 0)
-        return near if data.ends is None else jnp.maximum(near, data.ends.most)
+        return jnp.maximum(near, data.ends.most)
 
     def enlarged(self, demand: int) -> Contact | None:
         """Return itself with tables for so many rows and half as many more; None where they have room."""

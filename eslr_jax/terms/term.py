@@ -100,6 +100,10 @@ class Term:
         """Return positions at t + 1 [m] as the frame ends with, in the place of those found, and its data."""
         return position, data
 
+    def is_far(self, data: Any) -> Bool[Array, ""] | bool:
+        """Return whether `correct` moved cloth so far that the frame is solved once more, from there on."""
+        return False
+
     def touched(self, problem: FrameProblem, data: Any) -> tuple[Contacts, Float[Array, " vertices"]] | None:
         """Return the points that vertices rub on, and the normal forces at t [N]; None: nothing rubs."""
         return None

@@ -17,7 +17,7 @@ _TIP = 2e-3  # [m], radius of the needle's tip and of the edge
 _HALF_ANGLE = np.radians(15.0)
 
 
-def _needle() -> tuple[Mesh, RoundedCone]:
+def needle() -> tuple[Mesh, RoundedCone]:
     """Return a cone with a round tip that points up to height zero, as a mesh and in closed form."""
     height = 0.25
     apex = -_TIP
@@ -36,7 +36,7 @@ def _needle() -> tuple[Mesh, RoundedCone]:
 def _build_needle(options: Mapping[str, Any]) -> Scenes:
     garment = make_cloth(sheet(_COLUMNS, _COLUMNS, (0.5, 0.5)), options)
     start = np.asarray(garment.rest_positions, np.float64) + np.array([0.003, 0.05, 0.004])
-    mesh, cone = _needle()
+    mesh, cone = needle()
     edge = capsule(_TIP, 0.7, around=12, rings=60)
     bar = Capsule(np.array([-0.35, 0.0, 0.0]), np.array([0.35, 0.0, 0.0]), _TIP)
     return {

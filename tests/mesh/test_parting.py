@@ -55,7 +55,7 @@ def test_legs_that_pass_each_other_between_two_frames_yield_at_both(body):
 
 
 def test_a_body_begins_to_yield_before_it_has_to(walking):
-    """Five still frames without a crossing, then one that crosses: what it yields is asked of the frames before."""
+    """Five still frames without a crossing, then one that crosses: the frames before it yield too."""
     positions, rest, faces = walking
     frames = np.concatenate([np.repeat(rest[None], 5, axis=0), positions[:1]])
     yielded = np.linalg.norm(parted(frames, rest, faces) - frames, axis=2).max(axis=1)
