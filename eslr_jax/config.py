@@ -20,8 +20,8 @@ Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
 """What a network may be deprived of, see `pipeline.report.evaluate`."""
 
 _MAY_BE_ZERO = (
-    "iterations", "tolerance", "warmup", "final_learning_rate", "still_probability", "noise", "girth",
-    "shape_range", "material_probability", "max_skipped", "seed",
+    "iterations", "tolerance", "warmup", "final_learning_rate", "still_probability", "turn_probability",
+    "noise", "girth", "shape_range", "material_probability", "max_skipped", "seed",
 )  # fmt: skip
 MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
@@ -123,6 +123,7 @@ class TrainConfig:
     horizon: int = 60  # longest trajectory [frames]
     horizon_growth: int = 60  # frames trained until it grows by a frame; with schedule "hood", trajectories
     still_probability: float = 0.0  # share of trajectories on a body that stands still
+    turn_probability: float = 0.0  # share of windows of frames at which the clip turns round, at full speed
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
     girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
     shape_range: float = 0.0  # [standard deviations], bound of a body's uniform shape coefficients (HOOD: 3)
@@ -165,7 +166,7 @@ class TrainConfig:
             raise ValueError(
                 'collision_stiffness needs energy_set = "consistent": HOOD has a ramp of its own'
             )
-        for name in ("material_probability", "still_probability"):
+        for name in ("material_probability", "still_probability", "turn_probability"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not self.garments or not self.vertices:

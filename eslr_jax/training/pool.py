@@ -75,6 +75,16 @@ def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], conf
     return Slot(state, frame, before, yaw, girth, jnp.int32(0), material, jnp.zeros((), bool), shape)
 
 
+def turn_round(key: Array, slot: Slot, data: TrainingData, probability: float) -> Slot:
+    """Return a trajectory whose body, with `probability`, goes back where it came from, at once and as fast.
+
+    Cloth that flies on is stretched then, as by a clip's end. It is rare in clips, so networks tear there.
+    """
+    is_turned = jax.random.uniform(key) < probability
+    onward = data.next_frame(slot.frame, slot.before)
+    return slot.replace(before=jnp.where(is_turned, onward, slot.before))
+
+
 def sample_material(key: Array, probability: float) -> Material:
     """Return a random fabric from HOOD's training ranges with `probability`, else cotton."""
     keys = jax.random.split(key, 5)

@@ -28,7 +28,7 @@ from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
-from eslr_jax.training.pool import Slot, empty_pool, start_trajectory
+from eslr_jax.training.pool import Slot, empty_pool, start_trajectory, turn_round
 from eslr_jax.types import ClothState, Normalizer, Obstacle, Scene
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
@@ -234,6 +234,7 @@ def _sample_gradient(
     def window(carry: tuple[Any, Slot], key: Array):
         total, slot = carry
         start = _living_slot(entry._replace(key=key, slot=slot), data, index, config)
+        start = turn_round(jax.random.fold_in(key, 1), start, data, config.turn_probability)
 
         def loss_of(trained):
             slot, frames = start, []

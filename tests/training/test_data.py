@@ -15,7 +15,7 @@ from eslr_jax.pose.motion import shape_body
 from eslr_jax.terms import Collision
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train
-from eslr_jax.training.pool import start_trajectory
+from eslr_jax.training.pool import start_trajectory, turn_round
 from eslr_jax.training.step import slot_problem
 
 
@@ -67,6 +67,20 @@ def test_clips_are_played_back_and_forth_and_never_into_each_other(small_garment
     assert play(0, 1) == [0, 1, 2, 3, 2, 1, 0, 1]  # a clip's first frame has none before it
     assert play(5, 4) == [5, 6, 5, 4, 5, 6, 5, 4]
     assert play(2, 2) == [2] * 8  # stands still
+
+
+def test_a_body_turns_round_in_its_clip_and_stands_where_it_stands(starts, small_data):
+    for slot in starts[1]:
+        onward = small_data.next_frame(slot.frame, slot.before)
+        turned = turn_round(jax.random.key(0), slot, small_data, 1.0)
+        back = small_data.next_frame(turned.frame, turned.before)
+        if slot.frame == slot.before:  # it stands
+            assert back == slot.frame
+        elif small_data.is_same_clip(2 * slot.frame - onward, slot.frame):
+            assert (int(turned.frame), int(back)) == (int(slot.frame), 2 * int(slot.frame) - int(onward))
+        else:  # an end of the clip
+            assert back == onward
+        assert turn_round(jax.random.key(0), slot, small_data, 0.0).before == slot.before
 
 
 def test_a_body_stands_still_as_often_as_asked(starts, small_data):
