@@ -17,7 +17,14 @@ from eslr_jax.networks.network import Network, Prediction
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.lbfgs import Minimum
-from eslr_jax.solver.potential import Point, contact_load, corrected, evaluate, potential_terms
+from eslr_jax.solver.potential import (
+    Point,
+    any_passed,
+    contact_load,
+    corrected,
+    evaluate,
+    potential_terms,
+)
 from eslr_jax.solver.solve import MOST_RESIDUAL, Start, lower_point, solve_frame
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
@@ -200,13 +207,6 @@ def past_state(
     """
     is_known = jnp.asarray(residual) <= MOST_RESIDUAL
     return PastState(before.position, before.velocity, timestep, is_known)
-
-
-def any_passed(problem: FrameProblem) -> Bool[Array, ""] | None:
-    """Return whether something may have passed through the cloth; None where no term watches that."""
-    found = [term.is_passed(data) for term, data in problem.parts]
-    watched = [one for one in found if one is not None]
-    return functools.reduce(jnp.logical_or, watched) if watched else None
 
 
 def buffer_demands(problem: FrameProblem) -> dict[str, Int[Array, ""]]:

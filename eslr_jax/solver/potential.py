@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from eslr_jax.numerics import components
 from eslr_jax.terms.problem import FrameProblem, pin
@@ -69,3 +70,10 @@ def corrected(
         position, data = term.correct(position, problem, data)
         ended.append(data)
     return position, tuple(ended)
+
+
+def any_passed(problem: FrameProblem) -> Bool[Array, ""] | None:
+    """Return whether something may have passed through the cloth; None where no term watches that."""
+    found = [term.is_passed(data) for term, data in problem.parts]
+    watched = [one for one in found if one is not None]
+    return functools.reduce(jnp.logical_or, watched) if watched else None

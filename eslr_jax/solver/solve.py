@@ -11,7 +11,6 @@ Source: Griewank and Walther 2008, Evaluating Derivatives, section 15 (implicit 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,7 +25,7 @@ from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
 from eslr_jax.solver.minres import LinearSolution, solve_symmetric
-from eslr_jax.solver.potential import Point, corrected, potential
+from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 
@@ -136,17 +135,14 @@ def _solve(
     if not is_corrected:
         return Solved(_minimum(problem, start, stop, memory), problem.data)
 
-    def any_of(found: Iterator[Any]) -> Array:
-        return functools.reduce(jnp.logical_or, found, jnp.zeros((), bool))
-
     def is_passed(data: tuple[Any, ...]) -> Array:
-        found = (term.is_passed(own) for term, own in zip(problem.terms, data, strict=True))
-        return any_of(one for one in found if one is not None)
+        found = any_passed(problem.replace(data=data))
+        return jnp.zeros((), bool) if found is None else found
 
     def is_going(carry: tuple[Solved, Array]) -> Array:
         (_, data), count = carry
-        is_far = any_of(term.is_far(own) for term, own in zip(problem.terms, data, strict=True))
-        return (count == 0) | ((count < _PASSES) & is_far)
+        far = (term.is_far(own) for term, own in zip(problem.terms, data, strict=True))
+        return (count == 0) | ((count < _PASSES) & functools.reduce(jnp.logical_or, far, False))
 
     def once(carry: tuple[Solved, Array]) -> tuple[Solved, Array]:
         last, count = carry
