@@ -28,8 +28,9 @@ from eslr_jax.pose.motion import pose_body
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.simulation.stepper import corrected, make_stepper
+from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.potential import corrected
 from eslr_jax.solver.preconditioner import stretched_stiffness
 from eslr_jax.solver.solve import Start, solve
 from eslr_jax.terms import FAST, Contact, scene_terms
@@ -82,7 +83,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
         f"whole frame, {ITERATIONS} iterations": (whole, (scene, state, step)),
     }
     if scene.term(Contact) is not None:
-        parts["what nothing passes"] = (jax.jit(corrected), (problem, minimise(problem, start, MANY)))
+        parts["what nothing passes"] = (jax.jit(corrected), (minimise(problem, start, MANY), problem))
     return parts
 
 
