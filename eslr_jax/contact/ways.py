@@ -63,7 +63,7 @@ def move_clear(
         meshes: Of both.
         is_free: Vertices that may be pushed.
         rows: Size of the tables of pairs; static.
-        most_met: Size of the tables of pairs that are met; static.
+        most_met: Size of the tables of pairs that are met; static. Without a size none are looked for.
     """
     count = x.shape[1]
     ways = jnp.concatenate([way, body_way], axis=1)
@@ -83,11 +83,13 @@ def move_clear(
         farthest = jnp.max(safe_norm(reached - part.end, axis=0))
         is_full = found.most > rows
         is_whole = (part.share == 0.0) & (part.length == 1.0) & (part.tries == 0)
-        met = jax.lax.cond(
-            is_whole & (farthest > FAR),
-            lambda: find_met(_rows(start), _rows(end), found.pairs, most_met),
-            lambda: part.met,
-        )
+        met = part.met
+        if most_met:  # where cloth is put on nobody asks for them, and they needn't be compiled
+            met = jax.lax.cond(
+                is_whole & (farthest > FAR),
+                lambda: find_met(_rows(start), _rows(end), found.pairs, most_met),
+                lambda: part.met,
+            )
         is_clear = (lack == 0) & (farthest <= _MARGIN) & ~is_full
         is_tried = part.tries + 1 >= _TRIES
         # With too small a table the frame is done anew.
