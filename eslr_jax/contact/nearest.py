@@ -16,7 +16,16 @@ from eslr_jax.contact.search import (
     opposing_faces,
 )
 from eslr_jax.contact.triangle import point_triangle
-from eslr_jax.numerics import Vector3, components, in_memory, safe_norm, safe_normalize, vertex_normals
+from eslr_jax.numerics import (
+    Vector3,
+    components,
+    cross3,
+    in_memory,
+    safe_norm,
+    safe_normalize,
+    sub3,
+    vertex_normals,
+)
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
@@ -27,6 +36,7 @@ _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of 
 CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 _IMPACT = 0.02  # [m] before the body, where the path of thrown cloth ends
+_EQUALLY = 1e-6  # [m] by which another face may be farther than the nearest, and is as near
 _SEARCHES = 8  # along such a path, at most; straight at a wall, two
 
 
@@ -353,3 +363,41 @@ def clear_of_body(
         return position + lift[:, None] * contacts.normals
 
     return jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)
+
+
+def is_inside(
+    may_be: Bool[Array, " vertices"],
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+) -> Bool[Array, " vertices"]:
+    """Return which vertices are inside the body, by the nearest of all its faces.
+
+    `find_contacts` looks at few faces. Along a needle it may take one across, behind which everything is. So what
+    it takes to be inside is looked at once more, one vertex at a time.
+
+    Args:
+        may_be: Vertices to look at.
+        position: Of them [m].
+        body: Surface vertices [m].
+        surface: Its faces.
+
+    Source: of several faces that are equally near the one decides that is seen least from the side, as in
+    Baerentzen and Aanaes 2005, doi 10.1109/TVCG.2005.49.
+    """
+    a, b, c = (components(body[corner]) for corner in surface.faces.T)
+    ab, ac = sub3(b, a), sub3(c, a)
+    normal = safe_normalize(jnp.stack(cross3(ab, ac), axis=1)).T
+    (ids,) = jnp.nonzero(may_be, size=len(may_be), fill_value=0)
+
+    def look(number: Array, found: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
+        vertex = ids[number]
+        query = tuple(jnp.broadcast_to(part, a[0].shape) for part in position[vertex])
+        _, u, v = point_triangle(query, a, b, c)  # type: ignore[arg-type]
+        offset = jnp.stack([q - o - u * i - v * j for q, o, i, j in zip(query, a, ab, ac, strict=True)])
+        distance, height = safe_norm(offset, axis=0), jnp.sum(offset * normal, axis=0)
+        is_nearest = distance <= jnp.min(distance) + _EQUALLY
+        steepest = jnp.argmax(jnp.where(is_nearest, jnp.abs(height), -1.0))
+        return found.at[vertex].set(height[steepest] < 0)
+
+    return jax.lax.fori_loop(0, jnp.sum(may_be), look, jnp.zeros_like(may_be))

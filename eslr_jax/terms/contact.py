@@ -13,11 +13,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lists import Motion, find_pairs, joint_meshes
-from eslr_jax.contact.nearest import clear_of_body
+from eslr_jax.contact.nearest import CLEARANCE, clear_of_body, is_inside
 from eslr_jax.contact.pairs import CHUNK, Met, closest, corners_of
-from eslr_jax.contact.ways import Moved, move_clear
+from eslr_jax.contact.ways import move_clear
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, components, dot3, segment_sum, sub3, vertex_normals
+from eslr_jax.terms.collision import Collision
 from eslr_jax.terms.friction import Friction, slip_energies
 from eslr_jax.terms.problem import (
     CONTACT_STIFFNESS,
@@ -28,7 +29,7 @@ from eslr_jax.terms.problem import (
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term
 from eslr_jax.terms.worn import Worn, parted_body
-from eslr_jax.types import BodyMotion, Garment, Obstacle, Scene
+from eslr_jax.types import BodyMotion, BodySurface, Garment, Obstacle, Scene
 
 _GROWTH = 16e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
 _ROWS = 8  # per vertex of the cloth, of the tables that a scene begins with; a T-shirt needs one, a dress two
@@ -51,6 +52,35 @@ def starting_rows(num_vertices: int) -> int:
 def _friction(problem: FrameProblem) -> Friction:
     """Return the friction of the scene; without one nothing rubs."""
     return next((term for term in problem.terms if isinstance(term, Friction)), Friction(coefficient=0.0))
+
+
+def _under_skin(
+    body: Float[Array, "surface_vertices 3"], surface: BodySurface
+) -> Float[Array, "surface_vertices 3"]:
+    """Return a body's vertices [m] so far under its skin that no edge of cloth on the skin dips into it."""
+    return body - _GROWTH * vertex_normals(body, surface.faces, surface.face_incidence)
+
+
+def _begun(problem: FrameProblem) -> Float[Array, "vertices 3"]:
+    """Return where the ways of cloth, and of the body behind it, begin at t [m].
+
+    That is where they are. But cloth inside the body begins on its skin, and then all of the body under it, as at
+    a scene's start: so cloth that was put inside, or was let through, comes out again.
+    """
+    body, garment, position = problem.body, problem.garment, problem.position
+    if body is None:
+        return position
+    start, touched = body.start, problem.data_of(Collision)
+    if touched is not None:
+        nearest = touched.nearest
+        depth = jnp.sum((nearest.points - position) * nearest.normals, axis=1)
+        may_be = nearest.is_near & (depth > 0) & garment.vertex_mask
+        if problem.pin_targets is not None:
+            may_be = may_be & ~garment.is_pinned
+        inside = is_inside(*jax.lax.stop_gradient((may_be, position, start, body.surface)))
+        position = jnp.where(inside[:, None], nearest.points + CLEARANCE * nearest.normals, position)
+        start = jax.lax.cond(jnp.any(inside), _under_skin, lambda body, _: body, start, body.surface)
+    return jnp.concatenate([position, start])
 
 
 def keeps_layers(scene: Scene) -> bool:
@@ -106,6 +136,7 @@ class Ends(NamedTuple):
 class Meetings(NamedTuple):
     """Pairs of a frame."""
 
+    start: Float[Array, "vertices 3"]  # of `_begun`
     near: NearPairs
     most_near: Int[Array, ""]  # that the fuller table of them would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
@@ -122,7 +153,7 @@ class Contact(Term):
 
     An energy can be overcome, and pairs that come near within the frame have none. So the positions that the
     frame would end with are pushed until no pair has met on the straight ways from the frame's start. Cloth that
-    starts uncrossed stays so. Where ends are pushed far, pairs that met on the way get the energy too, along the
+    starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed far, pairs that met on the way get the energy too, along the
     direction that parted them last, and the frame is solved once more. The body yields where its own parts pass
     through each other (`mesh.parting`). Where that does not make room, something is let through, and the
     trajectory says in which frame.
@@ -177,12 +208,12 @@ class Contact(Term):
             return position
         now = body.positions[0]
         position = clear_of_body(position, now, body.surface, garment)
-        inwards = -_GROWTH * vertex_normals(now, body.surface.faces, body.surface.face_incidence)
+        under = _under_skin(now, body.surface)
         grown = move_clear(
             position.T,
             jnp.zeros_like(position.T),
-            (now + inwards).T,
-            -inwards.T,
+            under.T,
+            (now - under).T,
             joint_meshes(garment, body.surface, has_layers=self.has_layers),
             garment.vertex_mask & ~garment.is_pinned,
             self._num_rows(len(position)),
@@ -195,9 +226,8 @@ class Contact(Term):
     def prepare(self, problem: FrameProblem) -> Meetings:
         """Return the pairs that are near at t."""
         garment, body, count = problem.garment, problem.body, len(problem.position)
-        start = end = problem.position
-        if body is not None:
-            start, end = jnp.concatenate([start, body.start]), jnp.concatenate([end, body.end])
+        start = _begun(problem)
+        end = start if body is None else jnp.concatenate([start[:count], body.end])
         x, y = components(start), components(end)
         is_cloth = jnp.arange(len(start)) < count
         half = 0.5 * _NEAR_CLOTH
@@ -211,7 +241,7 @@ class Contact(Term):
             here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
             kinds.append(self._near(rows.ids, rows.count, is_edge, here, here, there, problem))
         near = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *kinds)
-        return Meetings(near, found.most, _friction(problem).slip(problem))
+        return Meetings(start, near, found.most, _friction(problem).slip(problem))
 
     def _near(
         self,
@@ -286,49 +316,36 @@ class Contact(Term):
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Meetings
     ) -> tuple[Float[Array, "vertices 3"], Meetings]:
         """Return positions at t + 1 [m] that are reached without crossing, and what came of it."""
-        garment, body = problem.garment, problem.body
+        garment, body, count = problem.garment, problem.body, len(position)
         is_free = garment.vertex_mask
         if problem.pin_targets is not None:
             is_free = is_free & ~garment.is_pinned
-        nothing = jnp.zeros((3, 0), position.dtype)
 
-        def moved(position: Array, problem: FrameProblem) -> Moved:
-            start = problem.position.T
-            ways = (nothing, nothing) if body is None else (body.start.T, (body.end - body.start).T)
-            surface = None if body is None else body.surface
-            meshes = joint_meshes(garment, surface, has_layers=self.has_layers)
-            return move_clear(
-                start,
-                position.T - start,
-                *ways,
-                meshes,
-                is_free,
-                self._num_rows(len(position)),
-                self._near_rows(len(position)),
-            )
-
-        ended = moved(*jax.lax.stop_gradient((position, problem)))
+        end = position if body is None else jnp.concatenate([position, body.end])
+        start = data.start.T
+        ways = end.T - start
+        surface = None if body is None else body.surface
+        ended = move_clear(
+            *jax.lax.stop_gradient((start[:, :count], ways[:, :count], start[:, count:], ways[:, count:])),
+            joint_meshes(garment, surface, has_layers=self.has_layers),
+            is_free,
+            self._num_rows(count),
+            self._near_rows(count),
+        )
         pushed = ended.position.T - jax.lax.stop_gradient(position)
         is_far = ended.met[0].count + ended.met[1].count > 0
         near = jax.lax.cond(
             is_far,
-            lambda: jax.lax.stop_gradient(self._with_met(data.near, ended.met, position, problem)),
+            lambda: jax.lax.stop_gradient(self._with_met(data, ended.met, end, problem)),
             lambda: jax.lax.stop_gradient(data.near),
         )
         return position + pushed, data._replace(near=near, ends=Ends(ended.is_passed, ended.most, is_far))
 
     def _with_met(
-        self,
-        near: NearPairs,
-        met: tuple[Met, Met],
-        position: Float[Array, "vertices 3"],
-        problem: FrameProblem,
+        self, data: Meetings, met: tuple[Met, Met], end: Float[Array, "vertices 3"], problem: FrameProblem
     ) -> NearPairs:
         """Return near pairs and those that cloth would meet on its way, as far as the table holds them."""
-        start, end = problem.position, position
-        if problem.body is not None:
-            start = jnp.concatenate([start, problem.body.start])
-            end = jnp.concatenate([end, problem.body.end])
+        start, near = data.start, data.near
         for (ids, share, count), is_edge in zip(met, (False, True), strict=True):
             here, there = corners_of(components(start), ids), corners_of(components(end), ids)
             parted = jax.tree.map(lambda a, b, share=share: (1.0 - share) * a + share * b, here, there)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cloth import grid_faces, make_garment
-from draped_ball import TIMESTEP, drifting_ball, square
+from draped_ball import RADIUS, TIMESTEP, drifting_ball, square
 from hard_cases.build import make_cloth, make_scene
 from hard_cases.build import sheet as plain_sheet
 from hard_cases.obstacles import needle
@@ -16,9 +16,10 @@ from eslr_jax.terms import Contact, Damping, Friction
 from eslr_jax.terms.stretch import principal_stretches
 
 
-def assert_nothing_crosses(trajectory, scene):
+def assert_nothing_crosses(trajectory, scene, first=0):
     faces, surface = np.asarray(scene.garment.faces), np.asarray(scene.body.surface.faces)
-    for cloth, body in zip(np.asarray(trajectory.positions), np.asarray(scene.body.positions), strict=True):
+    frames = np.asarray(trajectory.positions)[first:], np.asarray(scene.body.positions)[first:]
+    for cloth, body in zip(*frames, strict=True):
         assert len(intersecting_pairs(cloth, faces, body, surface)) == 0
 
 
@@ -37,6 +38,18 @@ def falling(scene, speed):
     """Return a scene whose cloth falls at so many metres a second."""
     falls = scene.initial_state.velocity.at[:, 1].set(-speed)
     return scene.replace(initial_state=scene.initial_state.replace(velocity=falls))
+
+
+@pytest.mark.parametrize("depth", [0.012, 0.03])
+def test_cloth_that_starts_inside_the_body_comes_out_of_it(depth):
+    pytest.importorskip("ipctk")
+    scene = prepare_scene(square(), drifting_ball(6), integrator="bdf2")
+    inside = scene.initial_state.position.at[:, 1].set(RADIUS - depth)
+    scene = scene.replace(initial_state=scene.initial_state.replace(position=inside))
+    trajectory = simulate(None, scene).trajectory
+    assert not trajectory.is_passed.any()
+    assert_nothing_crosses(trajectory, scene, first=1)
+    assert float(principal_stretches(trajectory.positions[-1], scene.garment)[0].max()) < 1.2
 
 
 def test_a_sheet_that_a_needle_stops_follows_what_the_needle_holds():

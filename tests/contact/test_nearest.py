@@ -3,6 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from hard_cases.build import icosphere
+from hard_cases.obstacles import needle
 
 from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene, rollout_scene
 from eslr_jax.contact.nearest import (
@@ -10,6 +12,7 @@ from eslr_jax.contact.nearest import (
     find_both_sides,
     find_contacts,
     find_near_vertices,
+    is_inside,
     nearest_point,
 )
 from eslr_jax.mesh.closest import closest_points
@@ -135,6 +138,28 @@ def test_beyond_the_boundary_of_a_part_nothing_is_touched(sphere):
     contacts = find(query, vertices, vertices, surface)
     np.testing.assert_array_equal(contacts.is_near, [False, True])
     assert contacts.distances[0] > 0
+
+
+def winding(query, corners):
+    """How often a closed surface of faces [faces, 3, 3] winds around points (Van Oosterom and Strackee 1983)."""
+    a, b, c = np.moveaxis(corners[None] - query[:, None, None], 2, 0)
+    x, y, z = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+    dot = [np.sum(one * other, axis=-1) for one, other in ((a, b), (b, c), (c, a))]
+    angle = np.arctan2(np.sum(a * np.cross(b, c), axis=-1), x * y * z + dot[0] * z + dot[1] * x + dot[2] * y)
+    return angle.sum(axis=1) / (2 * np.pi)
+
+
+@pytest.mark.parametrize("mesh", [needle()[0], icosphere(2, 0.25)], ids=["needle", "ball"])
+def test_what_is_inside_is_known_beside_thin_parts_too(mesh):
+    rng = np.random.default_rng(0)
+    vertices, faces = mesh
+    anywhere = rng.uniform(vertices.min(axis=0) - 0.01, vertices.max(axis=0) + 0.01, (300, 3))
+    near = rng.choice(vertices, 300) + 3e-3 * rng.normal(size=(300, 3))
+    query = np.concatenate([anywhere, near])
+    surface = prepare_surface(vertices, faces)
+    body = jnp.asarray(vertices, jnp.float32)[surface.vertex_ids]
+    found = jax.jit(is_inside)(jnp.ones(600, bool), jnp.asarray(query, jnp.float32), body, surface)
+    np.testing.assert_array_equal(found, winding(query, vertices[faces]) > 0.5)
 
 
 @pytest.mark.slow  # a rollout of a garment of 4k vertices on each test clip
