@@ -1,6 +1,7 @@
 """Count what passes through what: garments and outfits on clips, from starts that differ by 0.01 mm.
 
     python experiments/contact.py [--starts 10] [--worn dress pants+tshirt] [--clip cmu_016_29] [--vertices 1k]
+                                  [--frames 100]
     python experiments/contact.py --smoke --out DIR
 
 All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every third
@@ -29,10 +30,9 @@ from eslr_jax.types import Scene, Trajectory
 
 OUTFITS = ("pants+tshirt", "shorts+dress", "underskirt+skirt", "tank+longsleeve", "pants+skirt")
 WORN = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress", *OUTFITS)
-FRAMES = 60
 EVERY = 3  # frames between those that are judged
 MOST_RESIDUAL = 20.0  # [weights]
-NAMES = ("worn", "vertices", "clip", "start")  # of a row
+NAMES = ("worn", "vertices", "clip", "frames", "start")  # of a row
 
 
 def skirt_of(dress: GarmentFile) -> GarmentFile:
@@ -60,7 +60,7 @@ def load(worn: str, vertices: str = "1k") -> GarmentFile:
     return one(worn) if len(names) == 1 else combine_garments([one(name) for name in names], names)
 
 
-def dressed(worn: str, clip: str, vertices: str = "1k", frames: int = FRAMES) -> Scene:
+def dressed(worn: str, clip: str, vertices: str = "1k", frames: int = 60) -> Scene:
     """Return the scene that the command makes of a garment, or of an outfit, on the beginning of a clip."""
     body = load_body()
     poses = with_settling(pose_body(body, load_motion(clip), num_frames=frames), SETTLE_FRAMES, body)
@@ -101,17 +101,24 @@ def main() -> None:
     options.add_argument("--worn", nargs="*", default=WORN)
     options.add_argument("--clip", nargs="*", default=load_splits()["motions"]["test"])
     options.add_argument("--vertices", default="1k")
+    options.add_argument("--frames", type=int, default=60)
     chosen = options.parse_args()
 
     use_compile_cache()
-    frames = 4 if chosen.smoke else FRAMES
+    frames = 4 if chosen.smoke else chosen.frames
     for worn in chosen.worn[: 1 if chosen.smoke else None]:
         for clip in chosen.clip[: 1 if chosen.smoke else None]:
             scene = dressed(worn, clip, chosen.vertices, frames)
             for start in range(chosen.starts):
                 run = simulate(None, shifted(scene, start), raises=False)
                 scene = run.scene.replace(initial_state=scene.initial_state)  # with buffers that suffice
-                row = {"worn": worn, "vertices": chosen.vertices, "clip": clip, "start": start}
+                row = {
+                    "worn": worn,
+                    "vertices": chosen.vertices,
+                    "clip": clip,
+                    "frames": frames,
+                    "start": start,
+                }
                 row |= judge(run.scene, run.trajectory)
                 put(chosen.out / "contact.json", "rows", row, NAMES, machine())
                 print(row, flush=True)

@@ -397,10 +397,13 @@ class Contact(Term):
         return jnp.maximum(near, data.ends.most)
 
     def enlarged(self, demand: int) -> Contact | None:
-        """Return itself with tables for so many rows and half as many more; None where they have room."""
+        """Return itself with tables for so many rows and half as many more; None where they have room.
+
+        Sizes double, so that scenes share compiled programs.
+        """
         if self.rows is None or demand <= self.rows:
             return None
-        return self.replace(rows=CHUNK * math.ceil(_HEADROOM * demand / CHUNK))
+        return self.replace(rows=CHUNK * 2 ** math.ceil(math.log2(_HEADROOM * demand / CHUNK)))
 
     def describe(self, garment: Garment) -> str:
         """Return what passes through what no more."""
