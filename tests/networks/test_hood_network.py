@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ SMALL = dataclasses.replace(MODELS["hood"], steps_per_stage=1, latent_size=8, re
 CORRECTING = dataclasses.replace(SMALL, correction_scale=1.0)
 
 
+@functools.cache
 def trained(config=SMALL):
     network, generator = config.new_network(), np.random.default_rng(1)
     return network.replace(
@@ -131,4 +133,4 @@ def test_gradient_matches_finite_differences():
 
 def test_a_garment_without_coarse_levels_is_refused():
     with pytest.raises(ConfigError, match="add_coarse_edges"):
-        jax.eval_shape(run, SMALL.new_network(), *make_scene(8, 6))
+        jax.eval_shape(run, trained(), *make_scene(8, 6))
