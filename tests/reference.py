@@ -1,7 +1,5 @@
 """Float64 NumPy oracles of the energies: plain formulas on plain arrays, sharing no code with the package."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -295,6 +295,17 @@ def layer_weights(stacked, layer):
     return jax.tree.map(lambda leaf: leaf[layer], stacked)
 
 
+@functools.cache
+def trained(config):
+    """Return a network whose biases and scales have values that a mistake would show."""
+    network, generator = config.new_network(), np.random.default_rng(1)
+    return network.replace(
+        params=jax.tree.map(
+            lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), network.params
+        )
+    )
+
+
 # --- scene --------------------------------------------------------------------------------------------------
 
 

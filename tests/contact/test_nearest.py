@@ -77,7 +77,7 @@ def test_a_padded_body_is_found_as_the_body_itself():
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["tshirt", "dress"])
+@pytest.mark.parametrize("name", ["tshirt", pytest.param("dress", marks=pytest.mark.slow)])
 def test_three_motions_of_a_garment_search_bodies_of_two_sizes(body, name):
     garment, shapes = load_garment(name), set()
     for motion in ("cmu_016_25", "cmu_016_29", "cmu_069_23"):

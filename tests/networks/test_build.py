@@ -1,7 +1,5 @@
 """Graphs and features against float64 NumPy, written down from the facts and not from the code."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

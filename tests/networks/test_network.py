@@ -1,16 +1,14 @@
 """The fast network against the plain one, and what must hold for any network on a graph."""
 
-from __future__ import annotations
-
 import dataclasses
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cloth import make_garment
-from reference_models import make_scene, plain_network, quick_jit, to_float64
+from reference_models import make_scene, plain_network, quick_jit, to_float64, trained
 
 from eslr_jax import ConfigError
 from eslr_jax.networks.apply import (
@@ -45,17 +43,6 @@ VARIANTS = {
 def quick(names, *chosen):
     """Parametrize by name; all but the chosen ones are slow: each compiles a network of its own."""
     return [name if name in chosen else pytest.param(name, marks=pytest.mark.slow) for name in names]
-
-
-@cache
-def trained(config):
-    """Return a network whose biases and scales have values that a mistake would show."""
-    network, generator = config.new_network(), np.random.default_rng(1)
-    return network.replace(
-        params=jax.tree.map(
-            lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), network.params
-        )
-    )
 
 
 def build_and_apply(network, garment, material, inputs):

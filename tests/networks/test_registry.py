@@ -1,7 +1,5 @@
 """Named models: their sizes, their weights, their scales, their files."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

@@ -1,7 +1,5 @@
 """Every energy of set `consistent`: oracles, gradients three ways, invariances, degenerate input."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """HOOD's losses against plain NumPy, quirk by quirk."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

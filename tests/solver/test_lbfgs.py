@@ -1,7 +1,5 @@
 """The minimiser: on quadratics, on cloth, and as a citizen of jit, vmap and scan."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

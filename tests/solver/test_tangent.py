@@ -1,7 +1,5 @@
 """The assembled Hessian against automatic differentiation, and the linear solver on it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import jax

@@ -1,7 +1,5 @@
 """What training runs of the quick tier learn from."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

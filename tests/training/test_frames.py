@@ -1,7 +1,5 @@
 """A training step of several frames, and of several trajectories side by side."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 

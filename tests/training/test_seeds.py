@@ -1,7 +1,5 @@
 """Several seeds in one compiled step train as each does alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -263,11 +263,11 @@ def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config):
     config = dataclasses.replace(config, model=model, refinement_weights="contraction")
     network = model.new_network()
     scene = prepare_scene(square(), drifting_ball(2), terms=FAST)
-    state = scene.initial_state
+    state = scene.initial_state.replace(position=1.1 * scene.initial_state.position)  # stretched
 
     @jax.jit
     def loss_and_energies(scene):
-        problem = first_problem(scene)
+        problem = first_problem(scene.replace(initial_state=state))
         loss, _ = physics_loss(network, problem, state, config)
         positions = network.predict(problem, state).positions
         points = jnp.concatenate([pushed_out_guess(problem)[None], positions])
