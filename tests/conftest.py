@@ -64,16 +64,6 @@ def small_trajectory(small_scene, small_config):
 
 
 @pytest.fixture(scope="session")
-def small_problem(small_scene, small_trajectory):
-    """The scene's third frame, in motion and in contact."""
-    from eslr_jax.pipeline.report.gap import trajectory_states
-    from eslr_jax.simulation.frame import frame_problem
-
-    states, inputs = jax.tree.map(lambda leaf: leaf[2], trajectory_states(small_trajectory, small_scene))
-    return jax.jit(frame_problem)(small_scene, states, inputs)
-
-
-@pytest.fixture(scope="session")
 def body():
     from eslr_jax import load_body
 

@@ -1,7 +1,5 @@
 """Float64 NumPy oracles of the energies: plain formulas on plain arrays, sharing no code with the package."""
 
-from __future__ import annotations
-
 import numpy as np
 
 
@@ -18,25 +16,13 @@ def face_areas(positions, faces):
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def stretch_densities(position, rest, faces):
-    """Return tr(G G) and tr(G) per face."""
-    squares, traces = np.zeros(len(faces)), np.zeros(len(faces))
-    for f, (i, j, k) in enumerate(faces):
-        rest_edges = np.stack([rest[i] - rest[k], rest[j] - rest[k]])
-        edges = np.stack([position[i] - position[k], position[j] - position[k]])
-        metric = rest_edges @ rest_edges.T
-        if np.linalg.det(metric) <= 0:
-            continue
-        # G = (C - I) / 2 has the traces of the metrics' quotient, whatever the frame of the rest triangle.
-        green = 0.5 * (np.linalg.solve(metric, edges @ edges.T) - np.eye(2))
-        squares[f], traces[f] = np.trace(green @ green), np.trace(green)
-    return squares, traces
-
-
 def stretch(position, rest, faces, mu, lame_lambda, thickness):
-    squares, traces = stretch_densities(position, rest, faces)
-    density = mu * squares + 0.5 * lame_lambda * traces**2
-    return np.sum(face_areas(rest, faces) * thickness * density)
+    rest_edges, edges = (x[faces[:, :2]] - x[faces[:, 2:]] for x in (rest, position))
+    # G = (C - I) / 2 has the traces of the metrics' quotient, whatever the frame of the rest triangle.
+    quotient = np.linalg.solve(*(e @ np.swapaxes(e, 1, 2) for e in (rest_edges, edges)))
+    green = 0.5 * (quotient - np.eye(2))
+    squares, trace = np.einsum("fij,fji->f", green, green), np.einsum("fii->f", green)
+    return np.sum(face_areas(rest, faces) * thickness * (mu * squares + 0.5 * lame_lambda * trace**2))
 
 
 def interior_edges(faces):

@@ -295,6 +295,17 @@ def layer_weights(stacked, layer):
     return jax.tree.map(lambda leaf: leaf[layer], stacked)
 
 
+@functools.cache
+def trained(config):
+    """Return a network whose biases and scales have values that a mistake would show."""
+    network, generator = config.new_network(), np.random.default_rng(1)
+    return network.replace(
+        params=jax.tree.map(
+            lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), network.params
+        )
+    )
+
+
 # --- scene --------------------------------------------------------------------------------------------------
 
 
@@ -314,7 +325,8 @@ def tube(num_around: int, num_along: int):
 
 def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool = False, seed: int = 0):
     """Return a tube, a fabric and random inputs; every tenth vertex is beyond the radius of world edges."""
-    from eslr_jax import Material, prepare_garment
+    from eslr_jax import prepare_garment
+    from eslr_jax.fabric.materials import COTTON
     from eslr_jax.networks.features import RefinementInputs
     from eslr_jax.types import Contacts
 
@@ -346,13 +358,7 @@ def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool 
     next_normals = next_normals / jnp.linalg.norm(next_normals, axis=1, keepdims=True)
     distances = jnp.where(jnp.arange(num_vertices) % 10 == 3, 0.05, 0.01 + noise(0.004))
     points = position - normals * distances[:, None]
-    material = Material(
-        density=jnp.float32(0.20022),
-        lame_mu=jnp.float32(23600.0),
-        lame_lambda=jnp.float32(44400.0),
-        bending_stiffness=jnp.float32(3.9625778e-5),
-        thickness=jnp.float32(4.7e-4),
-    )
+    material = jax.tree.map(jnp.asarray, COTTON)
     weight = 9.81 * material.density * garment.vertex_areas
     contacts = Contacts(
         points=points,

@@ -1,3 +1,5 @@
+"""Contacts with a body and the searches that they are made of, against brute force."""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +17,10 @@ from eslr_jax.contact.nearest import (
     is_inside,
     nearest_point,
 )
+from eslr_jax.contact.search import PosedSurface, nearest_faces, opposing_faces
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.surface import pad_body, pad_surface, prepare_surface
+from eslr_jax.mesh.surface import compact_groups, pad_body, pad_surface, prepare_surface
+from eslr_jax.numerics import vertex_normals
 from eslr_jax.pipeline.assets import load_splits
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Obstacle
@@ -76,7 +80,7 @@ def test_a_padded_body_is_found_as_the_body_itself():
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["tshirt", "dress"])
+@pytest.mark.parametrize("name", ["tshirt", pytest.param("dress", marks=pytest.mark.slow)])
 def test_three_motions_of_a_garment_search_bodies_of_two_sizes(body, name):
     garment, shapes = load_garment(name), set()
     for motion in ("cmu_016_25", "cmu_016_29", "cmu_069_23"):
@@ -112,19 +116,75 @@ def test_near_vertices_are_the_nearest_ones(sphere):
     np.testing.assert_allclose(found.next_points - found.points, np.tile(offset, (600, 1)), atol=1e-6)
 
 
-def test_cloth_between_two_limbs_sees_both():
+@pytest.fixture(scope="module")
+def spheres():
+    """Two balls three centimetres apart: positions, search tables."""
     left = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
     right = left.copy()
     right.apply_translation([0.23, 0.0, 0.0])
     both = trimesh.util.concatenate(left, right)
     surface = prepare_surface(both.vertices, both.faces)
-    vertices = jnp.asarray(both.vertices, jnp.float32)[surface.vertex_ids]
+    return np.asarray(both.vertices)[np.asarray(surface.vertex_ids)], surface
+
+
+def test_cloth_between_two_limbs_sees_both(spheres):
+    vertices, surface = jnp.asarray(spheres[0], jnp.float32), spheres[1]
     query = jnp.array([[0.11, 0.0, 0.0], [-0.11, 0.0, 0.0]])  # between the two, and beyond the left one
     contacts, opposing = jax.jit(find_both_sides)(query, vertices, vertices, surface)
     np.testing.assert_allclose(contacts.distances, [0.01, 0.01], atol=1e-3)
     np.testing.assert_array_equal(opposing.is_near, [True, False])
     np.testing.assert_allclose(opposing.distances[0], 0.02, atol=1e-3)
     np.testing.assert_allclose(opposing.normals[0], [-1.0, 0.0, 0.0], atol=0.05)
+
+
+@pytest.mark.parametrize("size", [1, 8])
+def test_nearest_faces_are_those_of_an_exact_search(spheres, size):
+    positions, surface = spheres
+    query = np.random.default_rng(0).uniform([-0.15, -0.15, -0.15], [0.4, 0.15, 0.15], (500, 3))
+    found = jax.jit(nearest_faces)(
+        jnp.asarray(query, jnp.float32),
+        jnp.asarray(positions, jnp.float32),
+        surface,
+        jnp.asarray(compact_groups(query, size), jnp.int32),
+    )
+    faces = np.asarray(surface.faces)
+
+    def distances(face, weights):
+        return np.linalg.norm(np.einsum("vc,vcx->vx", weights, positions[faces[face]]) - query, axis=1)
+
+    exact = distances(*closest_points(query, positions, faces))
+    own = [
+        closest_points(q[None], positions, faces[f][None])[1][0] for q, f in zip(query, found, strict=True)
+    ]
+    error = distances(np.asarray(found), np.stack(own)) - exact
+    assert error.max() < 1e-3
+    assert np.mean(error > 1e-5) < 0.01
+
+
+def test_opposing_faces_are_there_for_the_points_that_brute_force_names(spheres):
+    positions, surface = spheres
+    generator = np.random.default_rng(1)
+    facing = generator.standard_normal((300, 3))
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    query = 0.105 * facing
+    normals = vertex_normals(jnp.asarray(positions, jnp.float32), surface.faces, surface.face_incidence)
+    body = PosedSurface(jnp.asarray(positions, jnp.float32), normals, 0.06)
+    blocks = jnp.asarray(compact_groups(query, 8), jnp.int32)
+    face, is_found = jax.jit(opposing_faces, static_argnums=5)(
+        jnp.asarray(query, jnp.float32), jnp.asarray(facing, jnp.float32), body, surface, blocks, -0.2
+    )
+    offset = positions[None] - query[:, None]
+    opposes = (np.asarray(normals) @ facing.T).T <= -0.2
+    opposes &= np.einsum("vsx,vx->vs", offset, facing) >= 0
+    distance = np.where(opposes, np.linalg.norm(offset, axis=2), np.inf)
+    nearest = distance.min(axis=1)
+    is_found, faces = np.asarray(is_found), np.asarray(surface.faces)
+    assert (nearest < 0.06).sum() > 20
+    assert np.all(is_found[nearest < 0.06])
+    assert not np.any(is_found[nearest == np.inf])
+    close = nearest < 0.06
+    on_face = np.take_along_axis(distance[:, :, None], faces[np.asarray(face)][:, :, None], axis=1)
+    np.testing.assert_allclose(on_face[close].min(axis=1)[:, 0], nearest[close], rtol=1e-3)
 
 
 def test_beyond_the_boundary_of_a_part_nothing_is_touched(sphere):

@@ -1,7 +1,5 @@
 """MAT on our own data: what joins faces, what it sees, how it keeps off the body, and that it learns."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""The experiments' adapter to Newton: what is computed without it, and, where it is installed, what it does."""
+"""The comparison with Newton: what is computed without it, and, where it is installed, what it does."""
 
 import dataclasses
 
@@ -18,6 +18,7 @@ from newton_cloth import (
     stable_substeps,
     strip_stiffness,
 )
+from peers import Method, our_method, teach
 
 from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.fabric.materials import COTTON
@@ -120,6 +121,16 @@ def test_contact_spring_pushes_as_our_cubic_does_through_the_whole_distance():
     assert contact_stiffness(scene) * radius == pytest.approx(float(forces.sum()) / count, rel=1e-4)
 
 
+@pytest.mark.slow
+def test_our_method_steps_as_a_rollout_does():
+    scene = drop_scene({}, columns=5, seconds=0.3).scene
+    method, state = our_method(scene, 2, 10), scene.initial_state
+    for frame in range(scene.num_frames - 1):
+        state = method.step(state, frame)
+    whole = rollout_scene(None, scene.replace(substeps=2), SimConfig(iterations=10))
+    np.testing.assert_allclose(state.position, whole.positions[-1], atol=1e-5)
+
+
 def newton_cloth(scene, setting):
     pytest.importorskip("newton")
     return NewtonCloth(scene, setting)
@@ -175,13 +186,12 @@ def test_newton_hangs_cloth_by_its_pins(setting):
 
 @pytest.mark.slow
 def test_vbd_minimises_our_potential_where_strains_are_small(tshirt):
-    peers = pytest.importorskip("peers")
     rest = np.asarray(tshirt.rest_positions)
     noise = 1e-4 * np.random.default_rng(0).normal(size=rest.shape)
     scene = make_scene(tshirt, rest + noise, 4, timestep=1 / 300)
-    method = peers.Method("VBD", 1, 200, newton_cloth(scene, Setting("vbd", 1, 200)))
+    method = Method("VBD", 1, 200, newton_cloth(scene, Setting("vbd", 1, 200)))
     truth = rollout_scene(None, scene, SimConfig(iterations=500))
-    gap, initial = peers.teach([method], scene, truth, every=1)
+    gap, initial = teach([method], scene, truth, every=1)
     assert (gap[0] / initial).max() < 1e-3
 
 

@@ -1,7 +1,5 @@
 """Baselines that see the body's motion and not the cloth."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

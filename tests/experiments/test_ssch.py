@@ -1,7 +1,5 @@
 """SSCH on our own data: the garment space, and that the network learns a motion and comes back from its file."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -188,51 +188,41 @@ def test_a_reference_that_is_not_finite_is_refused():
         rollouts.find_references(SETTING)
 
 
+def reproduce(tmp_path, what, eslr="", **environment):
+    """Run the paper's script with stand-ins for its programs; return its exit code and the calls of them."""
+    for name, does in (("eslr", eslr), ("python", "")):
+        program = tmp_path / name
+        program.write_text(f'#!/bin/sh\necho {name} "$@" >> "{tmp_path}/calls"\n{does}\n')
+        program.chmod(0o755)
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", **environment}
+    script = Path(rollouts.__file__).with_name("reproduce.sh")
+    ended = subprocess.run(["bash", script, what, tmp_path / "out"], env=path, check=False)
+    return ended.returncode, (tmp_path / "calls").read_text().splitlines()
+
+
 def test_the_papers_script_stops_where_a_training_was_stopped(tmp_path):
     """`eslr train` ends without an error after Ctrl-C."""
-    for name in ("eslr", "python"):
-        program = tmp_path / name
-        program.write_text(f'#!/bin/sh\necho {name} >> "{tmp_path}/calls"\n')
-        program.chmod(0o755)
-    script = Path(rollouts.__file__).with_name("reproduce.sh")
-    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    ended = subprocess.run(["bash", script, "small", tmp_path / "out"], env=path, check=False)
-    assert ended.returncode == 1
-    assert (tmp_path / "calls").read_text().split() == ["eslr"]
+    code, calls = reproduce(tmp_path, "small")
+    assert (code, [call.split()[0] for call in calls]) == (1, ["eslr"])
 
 
 def test_the_papers_form_is_trained_by_equal_recipes_and_in_pieces(tmp_path):
-    program = tmp_path / "eslr"
-    program.write_text(f'#!/bin/sh\necho "$@" >> "{tmp_path}/calls"\nmkdir -p "$5/checkpoints/1"\n')
-    program.chmod(0o755)
-    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "MINUTES": "120"}
-    script = Path(rollouts.__file__).with_name("reproduce.sh")
     for _ in range(2):
-        subprocess.run(["bash", script, "acceleration", tmp_path / "out"], env=path, check=False)
-    first, second = (tmp_path / "calls").read_text().splitlines()
+        _, calls = reproduce(tmp_path, "acceleration", 'mkdir -p "$5/checkpoints/1"', MINUTES="120")
+    first, second = calls
     assert "1k-acceleration.toml" in first
     assert first.endswith("--set=model.base=eslr-5 --set=seed=0 --minutes 120")
-    assert second == f"train --out {tmp_path}/out/eslr-5-s0 --resume --minutes 120"
+    assert second == f"eslr train --out {tmp_path}/out/eslr-5-s0 --resume --minutes 120"
 
 
 def test_the_papers_script_trains_every_network_twice_and_tabulates_the_second(tmp_path):
-    program = tmp_path / "eslr"  # writes what it is asked for, and weights where it is to write them
-    program.write_text(
-        '#!/bin/sh\necho "$@" >> "$CALLS"\nwhile [ "$1" != --out ]; do shift; done\n'
-        'mkdir -p "$2"; touch "$2/model.npz"\n'
-    )
-    (tmp_path / "python").write_text('#!/bin/sh\necho "$@" >> "$CALLS"\n')
-    for name in ("eslr", "python"):
-        (tmp_path / name).chmod(0o755)
-    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "CALLS": str(tmp_path / "calls")}
-    script = Path(rollouts.__file__).with_name("reproduce.sh")
-    out = tmp_path / "out"
-    subprocess.run(["bash", script, "small", out], env=path, check=True)
-    *trainings, tables = (tmp_path / "calls").read_text().splitlines()
+    writes = 'while [ "$1" != --out ]; do shift; done\nmkdir -p "$2"; touch "$2/model.npz"'
+    code, (*trainings, tables) = reproduce(tmp_path, "small", writes)
+    assert code == 0
     networks = [*(row.split("=")[0] for row in DEEP), "mgn-16"]  # which has no weights here
     assert len(trainings) == 4 * len(networks)
     for network in networks:
-        first, second = f"{out}/{network}-s0/model.npz", f"{out}/{network}-s0-on/model.npz"
+        first, second = (f"{tmp_path}/out/{network}-{run}/model.npz" for run in ("s0", "s0-on"))
         (going_on,) = (line for line in trainings if f"--start-from {first} " in line)
         assert f"--set=model.base={network} --set=seed=10" in going_on
-        assert f" {network}={second},{out}/{network}-s1-on/model.npz " in tables
+        assert f" {network}={second},{tmp_path}/out/{network}-s1-on/model.npz " in tables

@@ -16,6 +16,11 @@ from eslr_jax.mesh.topology import unique_edges
 from eslr_jax.pipeline.assets import asset_names, load_garment_file
 
 
+def load(name, vertices):
+    garment = load_garment_file(name, vertices=vertices)
+    return garment.rest_positions, garment.faces
+
+
 def relative_errors(positions, faces, num_sources=5):
     exact_solver = pytest.importorskip("pygeodesic.geodesic", reason="extra dev")
     sources = np.random.default_rng(0).integers(0, len(positions), num_sources)
@@ -36,8 +41,8 @@ def test_graph_is_symmetric_and_holds_every_edge(mesh):
 
 
 def test_shortcuts_of_a_flat_sheet_are_straight_lines(builders):
-    positions, faces = builders.sheet(7, 7, jitter=0.02)
-    positions[:, 2] = 0
+    positions, faces = builders.sheet(7, 7, jitter=0.2)
+    positions[:, 1] = 0
     pairs, lengths = unfolded_shortcuts(positions, faces)
     straight = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
     np.testing.assert_allclose(lengths, straight, rtol=1e-12)
@@ -47,7 +52,7 @@ def test_shortcuts_of_a_flat_sheet_are_straight_lines(builders):
 def test_distances_do_not_change_along_a_fold(builders):
     positions, faces = builders.sheet(5, 6)
     behind = np.maximum(positions[:, 0] - 0.2, 0)  # folded by a right angle along the third column
-    folded = np.stack([np.minimum(positions[:, 0], 0.2), positions[:, 1], behind], axis=1)
+    folded = np.stack([np.minimum(positions[:, 0], 0.2), behind, positions[:, 2]], axis=1)
     flat, bent = (geodesic_distances(geodesic_graph(p, faces), np.arange(30)) for p in (positions, folded))
     np.testing.assert_allclose(bent, flat, atol=1e-12)
 
@@ -59,9 +64,9 @@ def test_distances_on_a_tube_are_exact_within_tolerance(builders, shape):
     assert np.abs(errors).mean() < 0.025
 
 
-def test_distances_on_a_garment_are_exact_within_tolerance(garment_folder):
-    with np.load(garment_folder / "tshirt_1k.npz") as arrays:
-        errors = relative_errors(arrays["rest_positions"].astype(float), arrays["faces"])
+def test_distances_on_a_garment_are_exact_within_tolerance():
+    positions, faces = load("tshirt", "1k")
+    errors = relative_errors(positions.astype(float), faces)
     assert errors.min() > -1e-9
     assert errors.mean() < 0.006  # measured 0.0036
 
@@ -77,9 +82,9 @@ def test_landmarks_are_spread_and_their_rows_are_distances(builders):
 
 
 def test_more_landmarks_than_vertices_takes_all(builders):
-    graph = geodesic_graph(*builders.octahedron())
+    graph = geodesic_graph(*builders.icosahedron())
     landmarks, _ = farthest_point_landmarks(graph, 100)
-    assert sorted(landmarks) == list(range(6))
+    assert sorted(landmarks) == list(range(12))
 
 
 def test_components_are_bridged_at_their_nearest_vertices(builders):
@@ -115,11 +120,6 @@ def mismatch(fine, coarse, **options):
     return np.sqrt(np.sum((embedding - matched) ** 2, axis=1).mean()) / size
 
 
-def load(name, vertices):
-    garment = load_garment_file(name, vertices=vertices)
-    return garment.rest_positions, garment.faces
-
-
 @pytest.mark.parametrize("mode", ["raw", "canonical"])
 def test_stress_on_a_tube(builders, mode):
     tube = builders.tube(32, 32)
@@ -127,27 +127,19 @@ def test_stress_on_a_tube(builders, mode):
 
 
 def test_flat_sheet_embeds_isometrically(builders):
-    sheet = builders.sheet(12, 12, jitter=0.02)
-    sheet[0][:, 2] = 0
+    sheet = builders.sheet(12, 12, jitter=0.2)
+    sheet[0][:, 1] = 0
     assert stress(*sheet, geodesic_embedding(*sheet, size=8)) < 0.02
 
 
-@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
-def test_renumbering_vertices_permutes_rows(builders, mode):
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])  # rounding alone turns the axes of `raw`
+def test_renumbering_vertices_permutes_rows_and_translation_changes_nothing(builders, mode):
     positions, faces = builders.tube(20, 15, flare=0.2, depth=0.8, twist=0.3)
-    permuted, permuted_faces, old = builders.permute(positions, faces)
+    permuted, permuted_faces, old = builders.permute(positions + np.array([0.1, 1.0, -0.3]), faces)
     embedding = geodesic_embedding(positions, faces, mode=mode)
     again = geodesic_embedding(permuted, permuted_faces, mode=mode)
     # ties between equally far landmarks may be broken otherwise; nothing else may change
     np.testing.assert_allclose(again, embedding[old], atol=0.02 * np.abs(embedding).max())
-
-
-@pytest.mark.parametrize("mode", ["canonical", "landmarks"])  # rounding alone turns the axes of `raw`
-def test_translation_changes_nothing(builders, mode):
-    positions, faces = builders.tube(20, 15, depth=0.8)
-    moved = geodesic_embedding(positions + np.array([0.1, 1.0, -0.3]), faces, mode=mode)
-    embedding = geodesic_embedding(positions, faces, mode=mode)
-    np.testing.assert_allclose(moved, embedding, atol=0.02 * np.abs(embedding).max())  # ties, as above
 
 
 @pytest.mark.parametrize("mode", ["canonical", "landmarks"])
@@ -174,8 +166,8 @@ def test_canonical_axes_follow_the_rest_pose(builders):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("size", [2, 8, 16])
 def test_any_size_on_a_tiny_mesh(builders, mode, size):
-    embedding = geodesic_embedding(*builders.octahedron(), size=size, mode=mode)
-    assert embedding.shape == (6, size)
+    embedding = geodesic_embedding(*builders.icosahedron(), size=size, mode=mode)
+    assert embedding.shape == (12, size)
     assert embedding.dtype == np.float64
     assert np.isfinite(embedding).all()
 
@@ -183,7 +175,7 @@ def test_any_size_on_a_tiny_mesh(builders, mode, size):
 @pytest.mark.parametrize("mode", MODES)
 def test_components_get_finite_coordinates(builders, mode):
     positions, faces = builders.sheet(6, 6)
-    both = np.concatenate([positions, positions + np.array([0.0, 0.0, 0.3])])
+    both = np.concatenate([positions, positions + np.array([0.0, 0.3, 0.0])])
     embedding = geodesic_embedding(both, np.concatenate([faces, faces + 36]), mode=mode)
     assert np.isfinite(embedding).all()
 

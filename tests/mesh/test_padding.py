@@ -146,7 +146,7 @@ def test_arrays_that_do_not_fit_are_named(builders, change, message):
 
 def test_disconnected_garment_prepares_on_request(builders):
     positions, faces = builders.sheet(4, 4)
-    both = np.concatenate([positions, positions + np.array([0, 0, 0.2])]), np.concatenate([faces, faces + 16])
+    both = np.concatenate([positions, positions + np.array([0, 0.2, 0])]), np.concatenate([faces, faces + 16])
     with pytest.raises(MeshError, match="2 separate components"):
         prepare(*both)
     garment = prepare(*both, allow_components=True)

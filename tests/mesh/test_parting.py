@@ -6,16 +6,16 @@ import jax
 import numpy as np
 import pytest
 
+from eslr_jax import load_garment, load_motion, pose_body
 from eslr_jax.mesh.parting import parted, uncrossed
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
+from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.terms.worn import Worn, parted_body
 
 
 @pytest.fixture(scope="module")
 def walking(body, tshirt):
     """What a T-shirt reaches of a walking body: arms touch the trunk, and a crease crosses itself."""
-    from eslr_jax import load_motion, pose_body
-
     poses = pose_body(body, load_motion("cmu_016_32"))
     surface = Worn(tshirt, poses).surface
     ids = np.asarray(surface.vertex_ids)
@@ -35,8 +35,6 @@ def test_a_body_that_crosses_itself_yields_by_millimetres(walking):
 
 def test_legs_that_pass_each_other_between_two_frames_yield_at_both(body):
     """A kick of 15 cm a frame: at its frames the legs are apart, and on straight ways between them not."""
-    from eslr_jax import load_garment, load_motion, pose_body
-
     poses = pose_body(body, load_motion("cmu_016_29"), num_frames=32)
     surface = Worn(load_garment("pants", vertices="1k"), poses).surface
     ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
@@ -85,8 +83,6 @@ def test_a_body_that_crosses_nothing_stays(walking):
 
 
 def test_a_crease_that_skinning_folds_through_itself_opens(tshirt, body, walk):
-    from eslr_jax.pose.lbs import skin_garment
-
     skinned = np.asarray(skin_garment(tshirt, walk.joint_transforms[:1]))[0]
     faces = np.asarray(tshirt.faces)
     assert len(intersecting_pairs(skinned, faces)) > 0

@@ -1,7 +1,5 @@
 """Random features against exact attention, in NumPy."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 from reference_models import exact_attention

@@ -1,18 +1,21 @@
 """Graphs and features against float64 NumPy, written down from the facts and not from the code."""
 
-from __future__ import annotations
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import jraph
 import numpy as np
 import pytest
+from draped_ball import drifting_ball, square
 from reference_models import make_scene, quick_jit, to_float64
 
+from eslr_jax import prepare_scene
 from eslr_jax.networks.apply import graph_inputs
 from eslr_jax.networks.build import GraphKind, build_graph, edge_set, feature_sizes, incoming_edges
 from eslr_jax.networks.features import mean_edge_length
-from eslr_jax.simulation.scene import initial_state
+from eslr_jax.simulation.frame import first_problem
+from eslr_jax.terms import FAST
 
 HOOD = GraphKind(reads_gradient=False, has_reverse_edges=True)
 GRADIENT = GraphKind(reads_gradient=True)
@@ -142,9 +145,10 @@ def test_with_the_state_a_vertex_deep_in_the_body_keeps_its_first_world_edge(sce
     np.testing.assert_array_equal(graph.receivers["world"][len(first) :], np.arange(len(first)))
 
 
-def test_the_other_world_edges_lead_to_the_nearest_body_vertices(small_problem):
-    problem, count = small_problem, small_problem.position.shape[0]
-    state = initial_state(problem.position, jnp.zeros_like(problem.position))
+def test_the_other_world_edges_lead_to_the_nearest_body_vertices():
+    scene = prepare_scene(square(), drifting_ball(2), terms=FAST)
+    problem, state = jax.jit(first_problem)(scene), scene.initial_state
+    count = len(problem.position)
     one, three = (
         quick_jit(graph_inputs, static_argnums=2)(problem, state, STATE._replace(world_edges=number)).contacts
         for number in (1, 3)
@@ -263,8 +267,7 @@ def test_material_per_face_and_hinge_matches_the_scalar(scene, hood_graph):
         density=jnp.full(garment.vertex_areas.shape[0], material.density),
     )
     graph = build(HOOD, (garment, varied, inputs))
-    for first, second in zip(jax.tree.leaves(graph), jax.tree.leaves(hood_graph), strict=True):
-        np.testing.assert_allclose(first, second, atol=1e-5)
+    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), graph, hood_graph)
 
 
 @pytest.mark.parametrize("config", BOTH)

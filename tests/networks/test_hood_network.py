@@ -1,14 +1,12 @@
 """The hierarchical network against NumPy."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_models import make_scene, plain_hood, quick_jit, to_float64
+from reference_models import make_scene, plain_hood, quick_jit, to_float64, trained
 
 from eslr_jax import ConfigError
 from eslr_jax.mesh.coarse import add_coarse_edges
@@ -25,15 +23,6 @@ from eslr_jax.types import tree_cast
 
 SMALL = dataclasses.replace(MODELS["hood"], steps_per_stage=1, latent_size=8, remat="none")
 CORRECTING = dataclasses.replace(SMALL, correction_scale=1.0)
-
-
-def trained(config=SMALL):
-    network, generator = config.new_network(), np.random.default_rng(1)
-    return network.replace(
-        params=jax.tree.map(
-            lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), network.params
-        )
-    )
 
 
 @quick_jit
@@ -54,7 +43,7 @@ def test_parameter_count_is_that_of_the_published_network():
 
 @pytest.mark.parametrize("body", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_network_matches_numpy(body):
-    network, graph, actual = run(trained(), *coarse_scene(body=body))
+    network, graph, actual = run(trained(SMALL), *coarse_scene(body=body))
     expected = plain_hood(*(to_float64(tree) for tree in (network, graph)))
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
@@ -101,15 +90,15 @@ def test_gradient_features_of_a_coarse_level_match_numpy():
 
 @pytest.mark.slow
 def test_padding_does_not_change_the_answer():
-    expected = run(trained(), *coarse_scene())[2]
-    actual = run(trained(), *coarse_scene(pad=True))[2]
+    expected = run(trained(SMALL), *coarse_scene())[2]
+    actual = run(trained(SMALL), *coarse_scene(pad=True))[2]
     np.testing.assert_allclose(actual[: len(expected)], expected, atol=2e-6 * np.abs(expected).max())
 
 
 @pytest.mark.numerics
 @pytest.mark.slow
 def test_gradient_matches_finite_differences():
-    single = (trained(), *coarse_scene())
+    single = (trained(SMALL), *coarse_scene())
     with jax.enable_x64(True):
         network, *scene = (tree_cast(tree, jnp.float64) for tree in single)
         network, graph, answer = run(network, *scene)
@@ -131,4 +120,4 @@ def test_gradient_matches_finite_differences():
 
 def test_a_garment_without_coarse_levels_is_refused():
     with pytest.raises(ConfigError, match="add_coarse_edges"):
-        jax.eval_shape(run, SMALL.new_network(), *make_scene(8, 6))
+        jax.eval_shape(run, trained(SMALL), *make_scene(8, 6))

@@ -1,15 +1,14 @@
 """The fast network against the plain one, and what must hold for any network on a graph."""
 
-from __future__ import annotations
-
 import dataclasses
-import functools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_models import make_scene, plain_network, quick_jit, to_float64
+from cloth import make_garment
+from reference_models import make_scene, plain_network, quick_jit, to_float64, trained
 
 from eslr_jax import ConfigError
 from eslr_jax.networks.apply import (
@@ -44,17 +43,6 @@ VARIANTS = {
 def quick(names, *chosen):
     """Parametrize by name; all but the chosen ones are slow: each compiles a network of its own."""
     return [name if name in chosen else pytest.param(name, marks=pytest.mark.slow) for name in names]
-
-
-@functools.cache
-def trained(config):
-    """Return a network whose biases and scales have values that a mistake would show."""
-    network, generator = config.new_network(), np.random.default_rng(1)
-    return network.replace(
-        params=jax.tree.map(
-            lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), network.params
-        )
-    )
 
 
 def build_and_apply(network, garment, material, inputs):
@@ -136,8 +124,7 @@ def test_gradient_matches_that_of_plain_code_in_float64(name):
         # The largest exponents of softmax features are not differentiated: an error of their epsilon, 1e-6.
         tolerance = 1e-10 if name != "gradient" else 1e-6
         tolerance *= max(np.abs(leaf).max() for leaf in jax.tree.leaves(plain))
-        for first, second in zip(jax.tree.leaves(fast), jax.tree.leaves(plain), strict=True):
-            np.testing.assert_allclose(first, second, atol=tolerance)
+        jax.tree.map(partial(np.testing.assert_allclose, atol=tolerance), fast, plain)
 
 
 @pytest.mark.parametrize("name", quick(["gradient", "smoothing", "gradient-body"], "smoothing"))
@@ -200,25 +187,10 @@ def test_messages_follow_the_graphs_senders(name, scene):
 
 
 def permute_garment(garment, order):
-    """Return the same garment with vertex `order[i]` at row i, its tables sorted as they must be."""
-    rank = np.argsort(order)
-    senders, receivers = rank[garment.senders], rank[garment.receivers]
-    sort = np.lexsort((senders, receivers))
-    return garment.replace(
-        rest_positions=garment.rest_positions[order],
-        sewn_positions=garment.sewn_positions[order],
-        faces=jnp.asarray(rank[garment.faces]),
-        vertex_areas=garment.vertex_areas[order],
-        senders=jnp.asarray(senders[sort]),
-        receivers=jnp.asarray(receivers[sort]),
-        reverse_edges=jnp.asarray(np.argsort(sort)[np.asarray(garment.reverse_edges)[sort]]),
-        neighbors=jnp.asarray(rank[garment.neighbors][order]),
-        neighbor_mask=garment.neighbor_mask[order],
-        face_incidence=garment.face_incidence[order],
-        hinge_incidence=garment.hinge_incidence[order],
-        geodesic_embedding=garment.geodesic_embedding[order],
-        is_pinned=garment.is_pinned[order],
-    )
+    """Return the same garment with vertex `order[i]` at row i."""
+    positions, faces = np.asarray(garment.rest_positions)[order], np.argsort(order)[garment.faces]
+    permuted = make_garment(positions, faces, is_pinned=np.asarray(garment.is_pinned)[order])
+    return permuted.replace(geodesic_embedding=garment.geodesic_embedding[order])
 
 
 @pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "paper", "smoothing"))
@@ -288,12 +260,8 @@ def test_a_batch_agrees_with_a_loop(way, scene):
 @pytest.mark.parametrize("rows", [TALL // 8, TALL + 88])
 def test_products_in_bfloat16_have_the_gradients_of_exact_ones(rows):
     """The backward pass is written by hand, and otherwise for many rows."""
-    x, w, c = (
-        jax.random.normal(key, shape)
-        for key, shape in zip(
-            jax.random.split(jax.random.key(0), 3), [(rows, 24), (24, 16), (rows, 16)], strict=True
-        )
-    )
+    random, shapes = np.random.default_rng(0), [(rows, 24), (24, 16), (rows, 16)]
+    x, w, c = (jnp.asarray(random.standard_normal(shape), jnp.float32) for shape in shapes)
 
     def gradients(precision):
         return jax.jit(jax.grad(lambda x, w: jnp.sum(matmul(x, w, precision) * c), argnums=(0, 1)))(x, w)

@@ -67,20 +67,16 @@ def test_a_batch_equals_one_by_one_with_its_own_vertices(batch, garments, poses)
     np.testing.assert_allclose(batch[padded].friction_loads, alone.friction_loads, atol=1e-3)
 
 
-def test_scenes_of_any_shape_come_back_in_order(garments, poses):
-    """Those of one shape go together, and as alone but for rounding."""
-    heavy = COTTON.replace(density=np.float32(0.4))
-    given = ((3, COTTON), (2, COTTON), (3, heavy))
-    motions = {count: drifting_ball(count) for count, _ in given}
-    scenes = [
-        prepare_scene(garments[0], motions[count], material=fabric, terms=CLOTH) for count, fabric in given
-    ]
+def test_scenes_of_any_shape_come_back_in_order(garments):
+    """Those of one shape go together; that this is as alone is shown above."""
+    scenes = [prepare_scene(garments[0], drifting_ball(count), terms=CLOTH) for count in (3, 2, 3)]
+    start = scenes[2].initial_state
+    scenes[2] = scenes[2].replace(initial_state=start.replace(position=start.position + 1.0))
     found = simulate_scenes(None, scenes, config=QUICK, batch_size=1)
     assert [one.num_frames for one in found] == [3, 2, 3]
-    for place in (0, 2):
-        alone = rollout_scene(None, scenes[place], QUICK)
-        np.testing.assert_allclose(found[place].positions, alone.positions, atol=1e-6)
-    assert not np.array_equal(found[0].positions, found[2].positions)
+    for one, scene in zip(found, scenes, strict=True):
+        np.testing.assert_array_equal(one.positions[0], scene.initial_state.position)
+    np.testing.assert_allclose(found[1].positions, found[0].positions[:2], atol=1e-6)
 
 
 def test_bundled_garments_form_a_group(poses):
@@ -149,14 +145,9 @@ def test_fabrics_that_lie_on_one_mesh_are_refused(garments, poses):
 
 @pytest.mark.slow
 def test_all_that_a_scene_can_model_maps_over_scenes(poses):
-    options = {
-        "terms": scene_terms(Ground(is_always=True), Damping(0.002)),
-        "integrator": "bdf2",
-        "substeps": 2,
-    }
-    scenes = prepare_scenes(
-        [square(8), square(7, is_pinned=np.array([0]))], [poses] * 2, FABRICS[:2], **options
-    )
+    garments = [square(8), square(7, is_pinned=np.array([0]))]
+    terms = scene_terms(Ground(is_always=True), Damping(0.002))
+    scenes = prepare_scenes(garments, [poses] * 2, FABRICS[:2], terms=terms, integrator="bdf2", substeps=2)
     together = rollout_scenes(None, stack_scenes(scenes), QUICK, batch_size=2)
     for row, scene in enumerate(scenes):
         alone = rollout_scene(None, scene, QUICK)
@@ -164,17 +155,9 @@ def test_all_that_a_scene_can_model_maps_over_scenes(poses):
 
 
 def test_unlike_scenes_are_not_stacked(garments, poses):
-    scene = prepare_scene(garments[0], poses, terms=FAST)
-    bare = prepare_scene(garments[0], poses, terms=CLOTH)
+    scene = prepare_scene(garments[0], poses, terms=CLOTH)
     with pytest.raises(ValueError, match="differ in what they model"):
-        stack_scenes([scene, bare])
-
-
-@pytest.mark.slow
-def test_batch_size_does_not_change_the_trajectories(garments, poses):
-    scenes = stack_scenes(prepare_scenes([garments[0]] * 2, [poses] * 2, FABRICS[:2]))
-    one_by_one, together = (rollout_scenes(None, scenes, QUICK, batch_size=size) for size in (1, 2))
-    np.testing.assert_allclose(one_by_one.positions, together.positions, atol=1e-5)
+        stack_scenes([scene, scene.replace(terms=CLOTH[:-1])])
 
 
 FOUR_DEVICES = """

@@ -8,7 +8,7 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax import SimConfig, Status, prepare_scene
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.potential import potential
@@ -21,12 +21,11 @@ CONFIG = MODELS["smooth-small"]
 def step_of():
     """The first frame of a sheet in free fall, by weights and by how much the sheet is stretched."""
     scene = prepare_scene(square(6), drifting_ball(3), terms=CLOTH, starts_at_rest=True)
-    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
     @jax.jit
     def step(network, stretch):
         state = scene.initial_state.replace(position=scene.initial_state.position * stretch)
-        problem = frame_problem(scene, state, inputs)
+        problem = first_problem(scene.replace(initial_state=state))
         guess = initial_guess(problem).position
         after, _ = make_stepper(network, SimConfig(iterations=0))(problem, state)
         return guess, after, jnp.stack([potential(x, problem) for x in (guess, after.position)])

@@ -115,37 +115,22 @@ def make_case(*, seed=0, dtype=np.float64, is_pinned=None) -> Case:
 
 
 def pad_case(case: Case) -> Case:
-    """Return the case with every array padded to a bucket; padded rows hold the last vertex's values."""
-    problem = case.problem
-    garment = pad_garment(problem.garment)
-    rows = garment.vertex_mask.shape[0] - problem.garment.vertex_mask.shape[0]
+    """Return the case with every array padded to a bucket; padded rows are the last one, without its load."""
+    plain = case.problem.garment
+    garment = pad_garment(plain)
+    tables = ("vertex_mask", "faces", "hinges")
+    sizes = {len(getattr(plain, name)): len(getattr(garment, name)) for name in tables}
 
-    def vertices(leaf):
-        return np.concatenate([leaf, np.repeat(leaf[-1:], rows, axis=0)])
+    def grow(leaf):
+        more = sizes[len(leaf)] - len(leaf) if leaf.ndim and len(leaf) in sizes else 0
+        return np.pad(leaf, [(0, more)] + [(0, 0)] * (leaf.ndim - 1), mode="edge") if more else leaf
 
-    def elements(leaf, like):
-        return np.pad(leaf, (0, len(like) - len(leaf)), mode="edge")
-
-    material = problem.material
-    *plain, body, (rubbing,) = problem.data
-    padded = problem.replace(
+    grown = jax.tree.map(grow, case._replace(problem=case.problem.replace(garment=None)))
+    *others, (rubbing,) = grown.problem.data
+    rubbing = rubbing._replace(force=rubbing.force * garment.vertex_mask)
+    problem = grown.problem.replace(
         garment=to_device(garment),
-        material=Material(
-            density=elements(material.density, garment.vertex_areas),
-            lame_mu=elements(material.lame_mu, garment.rest_areas),
-            lame_lambda=elements(material.lame_lambda, garment.rest_areas),
-            bending_stiffness=elements(material.bending_stiffness, garment.hinge_rest_areas),
-            thickness=elements(material.thickness, garment.rest_areas),
-        ),
-        position=vertices(problem.position),
-        inertial_guess=vertices(problem.inertial_guess),
-        friction_load=np.pad(problem.friction_load, (0, rows)),
-        data=(
-            *plain,
-            body._replace(
-                nearest=jax.tree.map(vertices, body.nearest), opposing=jax.tree.map(vertices, body.opposing)
-            ),
-            (Rubbing(jax.tree.map(vertices, rubbing.contacts), np.pad(rubbing.force, (0, rows))),),
-        ),
+        friction_load=grown.problem.friction_load * garment.vertex_mask,
+        data=(*others, (rubbing,)),
     )
-    return Case(padded, vertices(case.position))
+    return grown._replace(problem=problem)

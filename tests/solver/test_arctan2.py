@@ -1,7 +1,5 @@
 """The polynomial that stands for atan2 in float32."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """HOOD's losses against plain NumPy, quirk by quirk."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -12,7 +10,6 @@ import reference
 from cloth import make_garment, make_sheet
 from physics_cases import TIMESTEP, pad_case, to_numpy
 
-from eslr_jax import Material
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
@@ -71,49 +68,26 @@ def evaluate(step, criterion):
 def oracle(step, criterion, position=None):
     at, problem = step
     position = at if position is None else position
-    garment, material, bodies, parameters = (
-        problem.garment,
-        problem.material,
-        problem.bodies,
-        problem.parameters,
-    )
-    rest = garment.rest_positions
-    mass = reference.masses(rest, garment.faces, material.density)
-    query, search, body = {
-        "postcvpr": (problem.current, bodies.current, bodies.next),
-        "cvpr": (problem.current, bodies.previous, bodies.current),
+    garment, material, bodies, own = problem.garment, problem.material, problem.bodies, problem.parameters
+    rest, faces, current = garment.rest_positions, garment.faces, problem.current
+    mass = reference.masses(rest, faces, material.density)
+    fabric = (material.lame_mu, material.lame_lambda, material.thickness)
+    searched = {
+        "postcvpr": (current, bodies.current, bodies.next),
+        "cvpr": (current, bodies.previous, bodies.current),
         "metric": (position, bodies.next, bodies.next),
     }[criterion]
-    is_metric = criterion == "metric"
-    before, after = (bodies.current, bodies.next) if is_metric else (bodies.previous, bodies.current)
+    rubbed = (bodies.current, bodies.next) if criterion == "metric" else (bodies.previous, bodies.current)
+    pressing = (own.collision_weight, own.collision_thickness)
+    rubbing = (own.friction_coefficient, own.gravity, own.friction_radius)
     return np.array(
         [
-            reference.stretch(
-                position, rest, garment.faces, material.lame_mu, material.lame_lambda, material.thickness
-            ),
-            reference.bending(position, rest, garment.faces, material.bending_stiffness, current_length=True),
-            reference.inertia(position, 2 * problem.current - problem.previous, mass, TIMESTEP),
-            reference.gravity(position, 0.0, mass, parameters.gravity),
-            reference.hood_collision(
-                position,
-                query,
-                search,
-                body,
-                bodies.faces,
-                parameters.collision_weight,
-                parameters.collision_thickness,
-            ),
-            reference.hood_friction(
-                position,
-                problem.current,
-                before,
-                after,
-                bodies.faces,
-                mass,
-                parameters.friction_coefficient,
-                parameters.gravity,
-                parameters.friction_radius,
-            ),
+            reference.stretch(position, rest, faces, *fabric),
+            reference.bending(position, rest, faces, material.bending_stiffness, current_length=True),
+            reference.inertia(position, 2 * current - problem.previous, mass, TIMESTEP),
+            reference.gravity(position, 0.0, mass, own.gravity),
+            reference.hood_collision(position, *searched, bodies.faces, *pressing),
+            reference.hood_friction(position, current, *rubbed, bodies.faces, mass, *rubbing),
         ]
     )
 
@@ -167,35 +141,24 @@ def test_the_three_criteria_look_at_different_bodies(step):
     assert late["postcvpr"] != pytest.approx(late["metric"], rel=1e-6)
 
 
-def flat_step(height, move=(0.0, 0.0, 0.0), is_pinned=None):
-    """A flat sheet over a flat, still floor; it moved by `move` in the last frame.
+@pytest.fixture(scope="module")
+def flat_step(step):
+    """Flat sheets over a flat, still floor, which moved in the last frame, of as many vertices as `step`."""
 
-    With as many vertices and faces as `step`, so that the same program runs.
-    """
-    garment = to_numpy(make_garment(*make_sheet(spacing=0.03, jitter=0), is_pinned=is_pinned))
-    current = garment.rest_positions + np.array([0, height, 0])
-    body, faces = make_sheet(7, 8, 0.03, jitter=0)
-    body = body - np.array([0.03, 0, 0.03])
-    of_vertices, of_faces, of_hinges = (
-        np.ones(len(rows)) for rows in (current, garment.faces, garment.hinges)
-    )
-    material = Material(
-        density=of_vertices * COTTON.density,
-        lame_mu=of_faces * COTTON.lame_mu,
-        lame_lambda=of_faces * COTTON.lame_lambda,
-        bending_stiffness=of_hinges * COTTON.bending_stiffness,
-        thickness=of_faces * COTTON.thickness,
-    )
-    problem = HoodProblem(
-        current=current,
-        previous=current,
-        bodies=BodyFrames(body, body, body, faces),
-        garment=garment,
-        material=material,
-        timestep=np.float64(TIMESTEP),
-        parameters=to_numpy(HoodParameters()),
-    )
-    return current + np.array(move), problem
+    def make(height, move=(0.0, 0.0, 0.0), is_pinned=None):
+        garment = to_numpy(make_garment(*make_sheet(spacing=0.03, jitter=0), is_pinned=is_pinned))
+        current = garment.rest_positions + np.array([0, height, 0])
+        floor, faces = make_sheet(7, 8, 0.03, jitter=0)
+        floor = floor - np.array([0.03, 0, 0.03])
+        return current + np.array(move), step[1].replace(
+            current=current,
+            previous=current,
+            bodies=BodyFrames(floor, floor, floor, faces),
+            garment=garment,
+            material=jax.tree.map(np.full_like, step[1].material, COTTON),
+        )
+
+    return make
 
 
 def weight_of(problem):
@@ -207,7 +170,7 @@ def losses(step, criterion="postcvpr"):
         return dict(zip(TERMS, evaluate(step, criterion)[0], strict=True))
 
 
-def test_friction_reaches_to_five_centimetres_and_a_half():
+def test_friction_reaches_to_five_centimetres_and_a_half(flat_step):
     """The radius of 3 mm is compared with squared distances."""
     near, far = (losses(flat_step(height, (0.001, 0.0, 0.0)))["friction"] for height in (0.04, 0.06))
     np.testing.assert_allclose(
@@ -216,7 +179,7 @@ def test_friction_reaches_to_five_centimetres_and_a_half():
     assert far == 0
 
 
-def test_friction_hardly_acts_along_z():
+def test_friction_hardly_acts_along_z(flat_step):
     """Its floor is the xy plane: sliding along x costs mu m g, along z a hundredth of it."""
     along_x, along_z = (flat_step(0.001, move) for move in ((0.002, 0.0, 0.0), (0.0, 0.0, 0.002)))
     limit = 0.5 * weight_of(along_x[1])
@@ -224,12 +187,12 @@ def test_friction_hardly_acts_along_z():
     np.testing.assert_allclose(losses(along_z)["friction"], limit * 0.002 * np.sqrt(1e-4), rtol=1e-9)
 
 
-def test_gravity_counts_from_the_worlds_origin():
+def test_gravity_counts_from_the_worlds_origin(flat_step):
     step = flat_step(2.0)
     np.testing.assert_allclose(losses(step)["gravity"], 2.0 * weight_of(step[1]), rtol=1e-9)
 
 
-def test_pins_add_a_constant_to_the_training_inertia_only():
+def test_pins_add_a_constant_to_the_training_inertia_only(flat_step):
     is_pinned = np.arange(30) < 6
     step = flat_step(0.1, (0.01, 0.0, 0.0), is_pinned)
     with jax.enable_x64(True):
@@ -290,10 +253,7 @@ def test_padding_changes_nothing(step, case32):
     values, gradients = evaluate((position, problem), "postcvpr")
     padded = pad_case(case32).problem
     count, rows = len(position), len(padded.position) - len(position)
-
-    def grow(x):
-        return np.concatenate([x, np.repeat(x[-1:], rows, axis=0)])
-
+    grow = partial(np.pad, pad_width=[(0, rows), (0, 0)], mode="edge")
     grown = problem.replace(
         current=grow(problem.current),
         previous=grow(problem.previous),

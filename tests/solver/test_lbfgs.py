@@ -1,7 +1,5 @@
 """The minimiser: on quadratics, on cloth, and as a citizen of jit, vmap and scan."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -47,16 +45,12 @@ def descend(
     )
 
 
-def make_quadratic(count=4, seed=0, condition=100.0):
-    """A positive definite matrix over `count` points, and its minimum."""
-    random = np.random.default_rng(seed)
+def make_function(count=4, condition=100.0):
+    """A quadratic of `count` points, and its minimum."""
+    random = np.random.default_rng(0)
     basis, _ = np.linalg.qr(random.standard_normal((3 * count, 3 * count)))
     matrix = basis * np.geomspace(1, condition, 3 * count) @ basis.T
-    return matrix, random.standard_normal((count, 3))
-
-
-def make_function(count=4):
-    matrix, center = make_quadratic(count)
+    center = random.standard_normal((count, 3))
 
     def function(x):
         offset = (x - jnp.asarray(center, x.dtype)).ravel()
@@ -224,15 +218,11 @@ def test_springs_of_collapsed_cloth_keep_a_tenth(case32):
 
 
 @jax.jit
-def solve(case, iterations, has_springs=True):
-    """Minimise a frame's potential from the case's position."""
+def solve(case, iterations, springs):
+    """Minimise a frame's potential from the case's position, with so much of the preconditioner's springs."""
     matrix = stiffness(case.problem, case.position)
-    return minimize(
-        lambda x: potential(x, case.problem),
-        case.position,
-        matrix.replace(springs=jnp.where(has_springs, matrix.springs, 0.0)),
-        Stop(iterations),
-    )
+    matrix = matrix.replace(springs=springs * matrix.springs)
+    return minimize(lambda x: potential(x, case.problem), case.position, matrix, Stop(iterations))
 
 
 @pytest.mark.parametrize(
@@ -243,30 +233,30 @@ def test_cloth_reaches_the_minimum_that_newtons_method_finds(is_pinned):
     """In float64; pinned vertices stay in place."""
     case = make_case(is_pinned=is_pinned)
     newton = minimize_newton(case.problem)
-    assert newton.iterations < 60
+    assert newton.nit < 60
     if is_pinned is not None:
         targets = case.problem.pin_targets
         case = case._replace(position=np.where(is_pinned[:, None], targets, case.position))
     with jax.enable_x64(True):
-        found = solve(case, 400)
+        found = solve(case, 400, 1.0)
         weight = float(jax.jit(weight_norm)(case.problem))
     if is_pinned is not None:
-        for position in (newton.position, found.position):
+        for position in (newton.x, found.position):
             np.testing.assert_array_equal(np.asarray(position)[is_pinned], targets[is_pinned])
     assert np.linalg.norm(found.gradient) < 1e-6 * weight
-    gap = potential_float64(case.position, case.problem) - newton.value
+    gap = potential_float64(case.position, case.problem) - newton.fun
     # Two starts may end in different folds; their energies differ by less than 0.2 % of the initial gap.
-    assert abs(float(found.value) - newton.value) < 2e-3 * gap
+    assert abs(float(found.value) - newton.fun) < 2e-3 * gap
 
 
 def test_springs_beat_the_diagonal(case32):
-    assert float(solve(case32, 10).value) < float(solve(case32, 10, has_springs=False).value)
+    assert float(solve(case32, 10, 1.0).value) < float(solve(case32, 10, 0.0).value)
 
 
 def test_padding_moves_nothing(case32):
     padded = pad_case(case32)
     count = len(case32.position)
-    found, plain = solve(padded, 10), solve(case32, 10)
+    found, plain = solve(padded, 10, 1.0), solve(case32, 10, 1.0)
     np.testing.assert_array_equal(found.position[count:], padded.position[count:])
     # Dot products over longer arrays associate otherwise, and ten iterations amplify that.
     np.testing.assert_allclose(found.position[:count], plain.position, atol=2e-5)
@@ -274,10 +264,10 @@ def test_padding_moves_nothing(case32):
 
 def test_vmap_equals_a_loop(case32):
     starts = np.stack([case32.position, case32.position + np.float32(0.002)])
-    batched = jax.jit(jax.vmap(lambda start, case: solve(case._replace(position=start), 10), (0, None)))
+    batched = jax.jit(jax.vmap(lambda start, case: solve(case._replace(position=start), 10, 1.0), (0, None)))
     together = batched(starts, case32)
     for k, start in enumerate(starts):
-        alone = solve(case32._replace(position=start), 10)
+        alone = solve(case32._replace(position=start), 10, 1.0)
         np.testing.assert_allclose(together.position[k], alone.position, atol=2e-5)
         assert int(together.iterations[k]) == int(alone.iterations)
 
@@ -290,22 +280,14 @@ def combine(function, position, directions):
     return combine_directions(function, Point(position, *jax.value_and_grad(function)(position)), directions)
 
 
-def make_scaled_quadratic(count=5, seed=0):
-    random = np.random.default_rng(seed)
-    root = random.standard_normal((3 * count, 3 * count))
-    center = random.standard_normal((count, 3))
-    directions = random.standard_normal((3, count, 3)) * np.array([1e-3, 1.0, 30.0])[:, None, None]
-
-    def function(x):
-        offset = root @ (x - center).ravel()
-        return 0.5 * offset @ offset
-
-    return function, jnp.zeros((count, 3)), jnp.asarray(directions)
+def directions_of_many_lengths():
+    return np.random.default_rng(1).standard_normal((3, 5, 3)) * np.array([1e-3, 1.0, 30.0])[:, None, None]
 
 
 def test_a_quadratic_is_minimised_in_the_span_whatever_the_lengths_of_the_directions():
     with jax.enable_x64(True):
-        function, position, directions = make_scaled_quadratic()
+        (function, _), directions = make_function(5), jnp.asarray(directions_of_many_lengths())
+        position = jnp.zeros((5, 3))
         move = combine(function, position, directions)
         slopes = jnp.einsum("kij,ij->k", directions, jax.grad(function)(position + move))
         before = jnp.einsum("kij,ij->k", directions, jax.grad(function)(position))
@@ -339,8 +321,8 @@ def test_a_step_that_would_blow_up_is_not_taken():
 
 
 def test_directions_of_zero_give_no_step_and_finite_gradients():
-    function, position, directions = make_scaled_quadratic()
-    position, directions = position.astype(jnp.float32), directions.astype(jnp.float32)
+    (function, _), position = make_function(5), jnp.zeros((5, 3))
+    directions = jnp.asarray(directions_of_many_lengths(), jnp.float32)
     np.testing.assert_array_equal(combine(function, position, jnp.zeros_like(directions)), 0.0)
 
     def after(scale):

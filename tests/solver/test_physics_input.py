@@ -1,7 +1,5 @@
 """Impossible materials, constants and timesteps are refused by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cloth import make_garment, make_sheet

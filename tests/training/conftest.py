@@ -1,9 +1,14 @@
 """What training runs of the quick tier learn from."""
 
-from __future__ import annotations
+import dataclasses
 
 import jax
 import pytest
+from cloth import make_limb, swing_motion
+
+from eslr_jax import TrainConfig
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.training.data import build_training_data
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -16,10 +21,6 @@ def optax_promotes():
 @pytest.fixture(scope="session")
 def small_data(small_garment):
     """The sleeve, on a limb that swings for twelve frames."""
-    from cloth import make_limb, swing_motion
-
-    from eslr_jax.training.data import build_training_data
-
     body = make_limb()
     return build_training_data([small_garment], body, [swing_motion(body, 12)])
 
@@ -27,18 +28,12 @@ def small_data(small_garment):
 @pytest.fixture(scope="session")
 def cheap_model():
     """One layer of eight channels: of all networks, its training step compiles fastest."""
-    import dataclasses
-
-    from eslr_jax.networks.registry import MODELS
-
     return dataclasses.replace(MODELS["smooth-small"], layers=1, refinement_steps=1, latent_size=8)
 
 
 @pytest.fixture(scope="session")
 def config(cheap_model):
     """Six steps, one program for all that take them."""
-    from eslr_jax import TrainConfig
-
     return TrainConfig(
         model=cheap_model,
         steps=6,

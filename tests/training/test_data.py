@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_limb, swing_motion
 
 from eslr_jax import ConfigError, pose_body
 from eslr_jax.contact.nearest import find_contacts
@@ -51,8 +52,6 @@ def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them(st
 
 
 def test_clips_are_played_back_and_forth_and_never_into_each_other(small_garment):
-    from cloth import make_limb, swing_motion
-
     body = make_limb()
     data = build_training_data([small_garment], body, [swing_motion(body, 4), swing_motion(body, 3)])
 
@@ -98,8 +97,6 @@ def test_a_body_stands_still_as_often_as_asked(starts, small_data):
 @pytest.fixture(scope="module")
 def shaped_data(small_garment):
     """The sleeve on a limb of two shapes: longer, with its joint higher up; and thicker."""
-    from cloth import make_limb, swing_motion
-
     limb, up = make_limb(), np.float32([0.0, 0.3, 0.0])
     rest = np.asarray(limb.rest_positions)
     longer, thicker = rest * np.float32([0.0, 0.1, 0.0]) + up / 15, rest * np.float32([0.05, 0.0, 0.05])
@@ -165,26 +162,15 @@ def test_a_run_on_shapes_keeps_them_while_a_trajectory_lives(config, shaped_data
     assert np.isfinite(np.array(state.pools[0].state.position)).all()
 
 
-def test_a_body_with_pose_blend_shapes_is_refused(small_garment):
-    from cloth import make_limb, swing_motion
-
-    body = make_limb()
-    bends = body.replace(pose_directions=jnp.zeros((len(body.rest_positions), 3, 9)))
-    with pytest.raises(ConfigError, match="pose blend shapes"):
-        build_training_data([small_garment], bends, [swing_motion(body, 4)])
-
-
-def test_clips_of_one_frame_are_refused(small_garment):
-    from cloth import make_limb, swing_motion
-
-    body = make_limb()
-    with pytest.raises(ConfigError, match="no clip has two frames"):
-        build_training_data([small_garment], body, [swing_motion(body, 1)])
-
-
-def test_a_body_without_shapes_refuses_them(small_garment):
-    from cloth import make_limb, swing_motion
-
-    body = make_limb()
-    with pytest.raises(ConfigError, match="no shapes; train with shape_range = 0"):
-        build_training_data([small_garment], body, [swing_motion(body, 3)], has_shapes=True)
+@pytest.mark.parametrize(
+    ("num_frames", "changed", "options", "message"),
+    [
+        (4, {"pose_directions": jnp.zeros((162, 3, 9))}, {}, "pose blend shapes"),
+        (1, {}, {}, "no clip has two frames"),
+        (3, {}, {"has_shapes": True}, "no shapes; train with shape_range = 0"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_refused(small_garment, num_frames, changed, options, message):
+    body = make_limb().replace(**changed)
+    with pytest.raises(ConfigError, match=message):
+        build_training_data([small_garment], body, [swing_motion(body, num_frames)], **options)

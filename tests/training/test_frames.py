@@ -1,7 +1,5 @@
 """A training step of several frames, and of several trajectories side by side."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 
@@ -9,19 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_network import Nudge
 
 from eslr_jax import TrainConfig
-from eslr_jax.networks.registry import MODELS
 from eslr_jax.training.step import _Entry, _sample_gradient, init_train_state, make_train_step
 
 FRAMES = 3
 
 
 @pytest.fixture(scope="module")
-def still(cheap_model):
+def still():
     """A run whose weights hardly move, and whose trajectories don't end."""
     return TrainConfig(
-        model=cheap_model,
+        model=Nudge(width=4),
         steps=9,
         warmup=0,
         learning_rate=1e-12,
@@ -73,21 +71,15 @@ def test_several_frames_of_trajectories_side_by_side_are_as_many_steps_of_one_by
 @pytest.fixture(scope="module")
 def measured(still, small_data):
     """Weights, and a function from how many frames a gradient passes to that of weights to gradient and loss."""
-    model = dataclasses.replace(
-        MODELS["mgn-5"], features="state", message_passing_steps=1, latent_size=8
-    )  # unlike refinement, it holds nothing fixed within a frame
-    config = dataclasses.replace(still, frames=2, model=model)
+    config = dataclasses.replace(still, frames=2)
     state = init_train_state(config, (small_data,))
-    output = state.network.statistics["output"]
-    output = output.replace(count=jnp.float32(1), squared_deviations=jnp.full(3, 1e-3**2))  # [m per frame^2]
-    network = state.network.replace(statistics={**state.network.statistics, "output": output})
     slot = jax.tree.map(lambda leaf: leaf[0], state.pools[0])
 
     def measure(params, through_time):
         trial = dataclasses.replace(config, through_time=through_time)
         keys = jax.random.split(jax.random.key(1), trial.frames // through_time)
         entry = _Entry(jnp.int32(0), keys, slot)
-        trained = network.replace(params=params)
+        trained = state.network.replace(params=params)
         # One step of two frames was taken: trajectories may have three.
         gradient, sample = _sample_gradient(trained, small_data, jnp.int32(1), entry, config=trial)
         return gradient, sample.metrics["loss"]

@@ -1,11 +1,10 @@
 """Several seeds in one compiled step train as each does alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
 import signal
+from functools import partial
 
 import jax
 import numpy as np
@@ -37,10 +36,8 @@ def test_seeds_together_are_each_alone(small_data, cheap_model):
     np.testing.assert_allclose(found, expected, rtol=1e-3)
     assert abs(expected[:, 0] - expected[:, 1]).min() > 0  # the seeds differ
     for place, state in enumerate(alone):
-        for one, other in zip(
-            jax.tree.leaves(take_seed(together, place).network), jax.tree.leaves(state.network), strict=True
-        ):
-            np.testing.assert_allclose(one, other, atol=1e-4)
+        found = take_seed(together, place).network
+        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-4), found, state.network)
         assert int(take_seed(together, place).step) == STEPS
 
 
@@ -61,7 +58,4 @@ def test_a_run_of_two_seeds_goes_on_and_exports_both(small_data, cheap_model, tm
         network = load_model(str(folder / "model.npz"))
         hours = records[-1]["core_seconds"] / 3600
         assert model_record(str(folder / "model.npz"))["core_hours"] == pytest.approx(hours / 2)
-        for exported, trained in zip(
-            jax.tree.leaves(network), jax.tree.leaves(take_seed(state, place).network), strict=True
-        ):
-            np.testing.assert_array_equal(exported, trained)
+        jax.tree.map(np.testing.assert_array_equal, network, take_seed(state, place).network)
