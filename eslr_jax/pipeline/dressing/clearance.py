@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.skinning import smooth, transfer_skin_weights
 from eslr_jax.pipeline.dressing.postures import Posture, rest_posture, unpose
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.types import Body
 
 CLEARANCE = 3e-3  # [m] left between cloth and skin: a millimetre over the thickness of collisions
@@ -46,8 +47,8 @@ def body_heights(
 
 
 def push_out(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], posture: Posture
-) -> tuple[Float[np.ndarray, "vertices 3"], dict[str, dict[str, float]]]:
+    positions: Positions, faces: Faces, posture: Posture
+) -> tuple[Positions, dict[str, dict[str, float]]]:
     """Move vertices that lie inside a posed body or closer than 3 mm out along the skin's normal.
 
     Their neighbours follow, so that no dents stay. Vertices deeper than 6 cm stay, and are counted apart.
@@ -89,18 +90,8 @@ def _millimetres(lengths: np.ndarray) -> float:
 
 
 def lay_to_rest(
-    placed: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    posture: Posture,
-    body: Body,
-    *,
-    is_pushed: bool = True,
-) -> tuple[
-    Float[np.ndarray, "vertices 3"],
-    Float[np.ndarray, "vertices 4"],
-    Int[np.ndarray, "vertices 4"],
-    dict[str, Any],
-]:
+    placed: Positions, faces: Faces, posture: Posture, body: Body, *, is_pushed: bool = True
+) -> tuple[Positions, Float[np.ndarray, "vertices 4"], Int[np.ndarray, "vertices 4"], dict[str, Any]]:
     """Return a garment in the body's rest pose, given it on the body in another pose [m].
 
     That is rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`,

@@ -15,6 +15,7 @@ from eslr_jax.mesh.skinning import smooth
 from eslr_jax.mesh.topology import inverse_rest_frames, is_on_boundary, vertex_normals
 from eslr_jax.pipeline.dressing.report import common_wearer
 from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 
 LAYER_GAP = 5e-3  # [m] left between two layers at rest: more than the thickness of the body's contact
 _REACH = 0.05  # [m] beneath a layer from which cloth is moved over it; deeper, it belongs to another limb
@@ -100,20 +101,16 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         corner_uvs=np.concatenate(uvs) if has_uvs else None,
         face_parts=np.concatenate(face_parts),
         part_names=tuple(part_names),
-        metadata={
-            "outfit": dict(zip(names, counts, strict=True)),
-            "fabrics": fabrics,
-            **wearer,
-        },
+        metadata={"outfit": dict(zip(names, counts, strict=True)), "fabrics": fabrics, **wearer},
     )
 
 
 def _move_over(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    positions: Positions,
+    faces: Faces,
     inner: Float[np.ndarray, "inner_vertices 3"],
     inner_faces: Int[np.ndarray, "inner_faces 3"],
-) -> Float[np.ndarray, "vertices 3"]:
+) -> Positions:
     """Return a layer with its vertices moved out over another one, and its faces off that one's vertices."""
     result = positions.copy()
     for _ in range(_ROUNDS):
@@ -135,9 +132,7 @@ def _move_over(
 
 
 def _heights(
-    points: Float[np.ndarray, "points 3"],
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    points: Float[np.ndarray, "points 3"], positions: Positions, faces: Faces
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"], Int[np.ndarray, " points"]]:
     """Return how high points are over a layer [m], infinite where they are beside it, its normals and faces.
 
@@ -151,9 +146,7 @@ def _heights(
     return np.where(is_beside, np.inf, heights), place.normals, place.faces
 
 
-def _flat(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "faces 3 2"]:
+def _flat(positions: Positions, faces: Faces) -> Float[np.ndarray, "faces 3 2"]:
     """Return the corners of every face in its own plane [m]."""
     edges = np.linalg.inv(inverse_rest_frames(positions, faces)).swapaxes(1, 2)
     return np.concatenate([edges, np.zeros((len(faces), 1, 2))], axis=1)

@@ -13,6 +13,7 @@ from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.topology import undirected_edges
 from eslr_jax.pipeline.dressing.repair import consistent_orientation
 from eslr_jax.pipeline.extras import require
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pipeline.formats.pattern import Pattern, Side, edge_length, signed_area
 
 _SIZES = (100, 100_000)  # vertices that may be asked for
@@ -26,10 +27,10 @@ _SMOOTHED = 4  # of these, in which vertices move to the middle of their neighbo
 class SewnMesh:
     """The panels of a pattern, joined along their seams."""
 
-    faces: Int[np.ndarray, "faces 3"]  # all turned the same way, outwards or inwards
+    faces: Faces  # all turned the same way, outwards or inwards
     panel_corners: Float[np.ndarray, "faces 3 2"]  # corners of each face in the plane of its panel [m]
-    placed: Float[np.ndarray, "vertices 3"]  # in the middle of the places that the panels give a vertex [m]
-    spans: Float[np.ndarray, "vertices 3"]  # from one side of its seam to the other, as placed [m]
+    placed: Positions  # in the middle of the places that the panels give a vertex [m]
+    spans: Positions  # from one side of its seam to the other, as placed [m]
     face_panels: Int[np.ndarray, " faces"]  # in the order of the pattern
     seam_edges: Int[np.ndarray, "edges 2"]  # mesh edges along seams
     edge_seams: Int[np.ndarray, " edges"]  # the seam of each
@@ -113,9 +114,7 @@ def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> S
 
 
 def _gathered(
-    flat: Float[np.ndarray, "rows 2"],
-    faces: Int[np.ndarray, "faces 3"],
-    pairs: list[tuple[np.ndarray, np.ndarray]],
+    flat: Float[np.ndarray, "rows 2"], faces: Faces, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> Float[np.ndarray, "faces 3 2"]:
     """Return the corners of faces [m], those along the longer side of a seam as short there as the other side.
 
@@ -154,7 +153,7 @@ def _divided(line: Float[np.ndarray, "points 2"], pieces: int) -> Float[np.ndarr
 
 def _triangulate(
     outline: Float[np.ndarray, "outline 2"], is_sewn: Bool[np.ndarray, " outline"], spacing: float
-) -> tuple[Float[np.ndarray, "vertices 2"], Int[np.ndarray, "faces 3"]]:
+) -> tuple[Float[np.ndarray, "vertices 2"], Faces]:
     """Return vertices of a panel, the outline's first, and its triangles.
 
     No edge inside joins two sewn vertices: two panels would have it in common besides the seam.
@@ -184,7 +183,7 @@ def _triangulate(
     return points, faces
 
 
-def _delaunay(points: Float[np.ndarray, "points 2"], num_outline: int) -> Int[np.ndarray, "faces 3"]:
+def _delaunay(points: Float[np.ndarray, "points 2"], num_outline: int) -> Faces:
     """Return triangles between points, which the closed line of the first ones bounds."""
     cdt = require("pythoncdt", extra="patterns", purpose="a sewing pattern")
     mesh = cdt.Triangulation(cdt.VertexInsertionOrder.AUTO, cdt.IntersectingConstraintEdges.NOT_ALLOWED, 0.0)

@@ -9,12 +9,13 @@ import dataclasses
 import re
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.spatial import KDTree
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.mesh.topology import boundary_loops, vertex_components
 from eslr_jax.pipeline.dressing.postures import body_middle, shoulder_height
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.types import Body
 
 WAISTBAND = 0.03  # [m] width of the band below the loop that is held, as an elastic waistband
@@ -50,8 +51,8 @@ def choose_pins(
     file_pins: Bool[np.ndarray, " vertices"],
     body: Body,
     *,
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    positions: Positions,
+    faces: Faces,
     **names,
 ) -> tuple[Bool[np.ndarray, " vertices"], str, list[str]]:
     """Return the pinned vertices, where the pins come from, and a warning if nothing holds the garment.
@@ -87,8 +88,8 @@ def choose_pins(
 
 def select_vertices(
     text: str,
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    positions: Positions,
+    faces: Faces,
     *,
     vertex_map: Int[np.ndarray, " source_vertices"],
     face_parts: Int[np.ndarray, " faces"] | None,
@@ -152,9 +153,7 @@ def _loop(text: str, rest: str, positions: np.ndarray, loops: list[np.ndarray]) 
     return loops[int(rest)]
 
 
-def find_waist(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], body: Body
-) -> Waist:
+def find_waist(positions: Positions, faces: Faces, body: Body) -> Waist:
     """Find what holds up the parts of a garment in the body's rest pose.
 
     A part that reaches above the shoulder joints hangs from them, unless it leaves more than 150 degrees around

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from eslr_jax.errors import MeshError
 from eslr_jax.mesh.validate import UNITS
@@ -20,6 +20,7 @@ from eslr_jax.pipeline.dressing.scoring import (
     sample_garment,
     wearing_cost,
 )
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 
 # Feet and decimetres have to be given: no garment's file was seen in them.
 _TRIED_UNITS = ("m", "cm", "mm", "in")
@@ -84,8 +85,8 @@ class Placement:
 
 
 def find_placement(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    positions: Positions,
+    faces: Faces,
     postures: list[Posture],
     options: FitOptions | None = None,
     *,

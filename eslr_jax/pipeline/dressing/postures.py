@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from eslr_jax.mesh.topology import face_cross_products, vertex_components, vertex_normals
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pose.motion import SHOULDERS, joint_transforms
 from eslr_jax.types import Body
 
@@ -95,9 +96,7 @@ class Posture:
         distance, side, _ = self.tangent_planes(points)
         return np.where(side < 0, -distance, distance)
 
-    def is_turned_in(
-        self, positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-    ) -> Bool[np.ndarray, " faces"]:
+    def is_turned_in(self, positions: Positions, faces: Faces) -> Bool[np.ndarray, " faces"]:
         """Return which faces belong to a piece that faces the body."""
         _, nearest = self.tree.query(positions[faces].mean(axis=1))
         outward = np.vecdot(face_cross_products(positions, faces), self.normals[self.touchable[nearest]])
@@ -171,11 +170,11 @@ def shoulder_height(body: Body) -> float:
 
 
 def unpose(
-    positions: Float[np.ndarray, "vertices 3"],
+    positions: Positions,
     skin_weights: Float[np.ndarray, "vertices influences"],
     skin_indices: Int[np.ndarray, "vertices influences"],
     transforms: Float[np.ndarray, "joints 3 4"],
-) -> Float[np.ndarray, "vertices 3"]:
+) -> Positions:
     """Undo linear blend skinning: return the rest positions that blended maps take to posed positions [m]."""
     blended = _blend(skin_weights, skin_indices, transforms)
     return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from eslr_jax.mesh.topology import boundary_loops, face_areas, vertex_areas
 from eslr_jax.numerics import pierces
 from eslr_jax.pipeline.dressing.postures import Posture
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 
 _POINTS = 160  # garment points whose distances are measured
 _TOP_POINTS = 16  # the highest of them, by which a garment hangs
@@ -35,7 +36,7 @@ class Sample:
     openings: Float[np.ndarray, "fans 3 3"]  # that close the boundary loops; none for a sheet's one outline
 
 
-def sample_garment(positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> Sample:
+def sample_garment(positions: Positions, faces: Faces) -> Sample:
     """Return a sample of a garment; equal garments give equal samples."""
     areas = vertex_areas(face_areas(positions, faces), faces, len(positions))
     picked = np.searchsorted(np.cumsum(areas) / areas.sum(), (np.arange(_POINTS) + 0.5) / _POINTS)

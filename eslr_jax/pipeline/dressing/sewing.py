@@ -30,6 +30,7 @@ from eslr_jax.pipeline.dressing.postures import Posture, rest_posture
 from eslr_jax.pipeline.dressing.report import wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape, pose_alike
 from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Positions
 from eslr_jax.pipeline.formats.pattern import Pattern
 from eslr_jax.pipeline.rigs.rig import body_skeleton
 from eslr_jax.pose.joints import find_parts
@@ -156,9 +157,7 @@ def _check_place(mesh: SewnMesh, pattern: Pattern, posture: Posture, name: str) 
             )
 
 
-def _judge(
-    mesh: SewnMesh, draped: Float[np.ndarray, "vertices 3"], pattern: Pattern
-) -> tuple[list[str], dict[str, Any]]:
+def _judge(mesh: SewnMesh, draped: Positions, pattern: Pattern) -> tuple[list[str], dict[str, Any]]:
     """Return warnings of what lies badly after sewing, and figures."""
     stretched, names = stretches(mesh, draped), list(pattern.panels)
     owners, _, pierced = piercing_edges(draped, mesh.faces)
@@ -247,7 +246,7 @@ def pattern_posture(body: Body) -> Posture:
         return rest_posture(body)
 
 
-def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
+def drape(mesh: SewnMesh, posture: Posture) -> Positions:
     """Return the vertices of a sewn mesh where its cloth lies around a body [m]."""
     columns, areas = _frames(mesh)
     num_vertices, num_faces = len(mesh.placed), len(mesh.faces)
@@ -282,9 +281,7 @@ def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
     return uncrossed(position, mesh.faces)
 
 
-def _beside(
-    points: Float[np.ndarray, "vertices 3"], spans: Float[np.ndarray, "vertices 3"], posture: Posture
-) -> Float[np.ndarray, "vertices 3"]:
+def _beside(points: Positions, spans: Positions, posture: Posture) -> Positions:
     """Return points, of which those of seams that begin in the body stand beside it [m].
 
     A seam between a panel before and one behind the body belongs to its outline as seen from there. So it leaves
@@ -328,7 +325,7 @@ def _frames(mesh: SewnMesh) -> tuple[Float[np.ndarray, "faces 3 2"], Float[np.nd
     )
 
 
-def stretches(mesh: SewnMesh, position: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, " faces"]:
+def stretches(mesh: SewnMesh, position: Positions) -> Float[np.ndarray, " faces"]:
     """Return the largest stretch of every face."""
     columns, _ = _frames(mesh)
     deformed = np.einsum("fck,fcx->fkx", columns, position[mesh.faces])

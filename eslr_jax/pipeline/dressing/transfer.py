@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float, Int
 from scipy.interpolate import RBFInterpolator
 from scipy.sparse.linalg import splu
 
@@ -18,6 +17,7 @@ from eslr_jax.pipeline.dressing.options import Scale
 from eslr_jax.pipeline.dressing.postures import Posture, rest_posture, take_posture
 from eslr_jax.pipeline.dressing.report import wearer_entry
 from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pipeline.rigs.alignment import align_rests
 from eslr_jax.pipeline.rigs.rig import body_skeleton
 from eslr_jax.pose.joints import Part, find_parts
@@ -79,14 +79,8 @@ def transfer_garment(
 
 
 def carry_shape(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    source: Posture,
-    made_for: Body,
-    target: Body,
-    *,
-    scale: Scale,
-) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"], Posture, dict[str, Any]]:
+    positions: Positions, faces: Faces, source: Posture, made_for: Body, target: Body, *, scale: Scale
+) -> tuple[Positions, Positions, Posture, dict[str, Any]]:
     """Carry a garment's shape [m] from a posed body, `source`, to another body in the same pose.
 
     A spline through the joints and the crotch maps space from one body to the other. Then the cloth moves along

@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.registry import find_reader
 
+# Of a mesh on the host, in the signatures of what fits and repairs it.
+Positions = Float[np.ndarray, "vertices 3"]  # [m]
+Faces = Int[np.ndarray, "faces 3"]
 _FOLDED = -1e-6  # share of a polygon's squared area below which a triangle looks the other way
 _SLIVER = 1e-4  # share of the squared sum of its edges' squares below which a polygon has no area
 
