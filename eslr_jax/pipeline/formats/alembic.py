@@ -3,10 +3,15 @@
 Vertices keep their order and their float32. Corners turn clockwise in Alembic: they are reversed both ways. It
 knows no unit, no skeleton and no material: metres are written with Y up, every mesh as points, parts of a garment
 as face sets. In a file with several meshes FILE#MESH,MESH names those to read.
+
+A damaged file may crash the library, so that the script `apart/alembic.py` reads in a process of its own.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,9 +20,9 @@ import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.files.atomic import atomic_write
+from eslr_jax.files.npz import read_arrays
 from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, identifiers, vertex_normals
-from eslr_jax.pipeline.formats.apart import read_apart
 from eslr_jax.pipeline.formats.mesh import MeshFile, cut_polygons, name_parts
 from eslr_jax.pipeline.formats.mesh_sequence import DEFAULT_FPS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader, writer
@@ -132,9 +137,21 @@ def read_alembic_sequences(path: Path, names: str = "", fps: float | None = None
 
 
 def _read(path: Path, names: str, frames: int) -> dict[str, np.ndarray]:
-    """Return the arrays of `apart/alembic.py`."""
+    """Return the arrays of `apart/alembic.py`, whose `sys.exit` is what a person must know of the file."""
     require("alembic3d", extra="alembic", purpose="Alembic")
-    return read_apart("alembic", path, names, frames)
+    script = Path(__file__).with_name("apart") / "alembic.py"
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "arrays.npz"
+        # -P: Python would look for its own modules beside the script first.
+        command = [sys.executable, "-P", script, path, out, names, str(frames)]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, errors="replace")
+        if done.returncode == 0:
+            return read_arrays(out, content="alembic")
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    if done.returncode == 1 and "Traceback (most recent call last)" not in done.stderr:
+        raise AssetError(f"{path}: {last}")
+    cause = last[:200] if done.returncode == 1 else "its reader crashed"
+    raise AssetError(f"{path} is damaged or no alembic file ({cause}); export it again")
 
 
 def _mesh(

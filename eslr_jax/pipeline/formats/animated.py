@@ -25,7 +25,7 @@ _RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float
 _FLAT = 0.05  # determinant of blended rotations below which a vertex can't be moved in every direction
 # A skin weight that moves a vertex by less than float32 resolves over a body's size.
 _NEGLIGIBLE_WEIGHT = 1e-6
-_LAYOUT = {  # of an AnimatedMesh and its Skin
+MESH_LAYOUT = {  # of an AnimatedMesh and its Skin
     "positions": ("f", "frames vertices 3"),
     "faces": ("iu", "faces 3", "vertices"),
     "corner_uvs": ("f", "faces 3 2"),
@@ -78,7 +78,7 @@ def check_moving(
 ) -> None:
     """Raise a MeshError, or `not_finite`, unless arrays are a mesh over time; see `check_layout`."""
     arrays = {"positions": positions, "faces": faces}
-    layout = {name: _LAYOUT[name] for name in arrays}
+    layout = {name: MESH_LAYOUT[name] for name in arrays}
     check_layout(arrays, layout, what=what, remedy=remedy, error=MeshError)
     if 0 in positions.shape or not len(faces):
         raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
@@ -98,11 +98,11 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
         arrays = {
             key: np.asarray(value)
             for key, value in vars(mesh).items()
-            if key in _LAYOUT and value is not None
+            if key in MESH_LAYOUT and value is not None
         }
         if mesh.skin is not None:
             arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
-        check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+        check_layout(arrays, MESH_LAYOUT, what=what, remedy=remedy, error=MeshError)
         check_moving(arrays["positions"], arrays["faces"], what=what, remedy=remedy)
         if mesh.skin is None:
             continue
