@@ -87,9 +87,8 @@ def fit_garment(
         clean.positions, clean.faces, postures, options, is_metric=mesh.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
-    clean, joined, doubts = _join(
-        dataclasses.replace(clean, positions=placement.apply(clean.positions)), options
-    )
+    clean = dataclasses.replace(clean, positions=placement.apply(clean.positions))
+    clean, joined, doubts = _join(clean, options)
     thickness = shell_thickness(clean.positions, clean.faces)
     if thickness is not None:
         doubts.append(
@@ -127,24 +126,20 @@ def fit_garment(
             sewn, faces, posture, made_for, body, scale=options.scale
         )
         transfer = {"transfer": carried}
-    rest, weights, indices, penetration = lay_to_rest(
-        placed, faces, worn_in, body, is_pushed=options.push_out
-    )
+    worn, penetration = lay_to_rest(placed, faces, worn_in, body, is_pushed=options.push_out)
     is_pinned, pinned_by, falling = choose_pins(
         options.pin,
         file_pins,
         body,
-        positions=rest,
+        positions=worn["rest_positions"],
         faces=faces,
         vertex_map=vertex_map,
         face_parts=parts,
         part_names=mesh.part_names,
     )
     return GarmentFile(
-        rest_positions=rest,
+        **worn,
         faces=faces,
-        skin_weights=weights,
-        skin_indices=indices,
         is_pinned=is_pinned,
         sewn_positions=sewn,
         corner_uvs=uvs,

@@ -37,12 +37,7 @@ class SewnMesh:
 
 
 def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> SewnMesh:
-    """Cut the panels of a pattern into triangles and join them.
-
-    Args:
-        pattern: Panels and seams.
-        num_vertices: About how many vertices the mesh is to have.
-        name: Name of the pattern in messages.
+    """Cut the panels of a pattern into triangles, with about so many vertices, and join them.
 
     Raises:
         ConfigError: The number is out of range.
@@ -54,11 +49,11 @@ def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> S
     area = sum(abs(signed_area(panel.outline)) for panel in pattern.panels.values())
     spacing = float(np.sqrt(2.0 * area / (np.sqrt(3.0) * num_vertices)))  # of equilateral triangles
     sewn = {side for seam in pattern.seams for side in seam.sides}
-    pieces = {
-        Side(key, number): _num_pieces(edge_length(edge) / spacing, 1 if Side(key, number) in sewn else 2)
-        for key, panel in pattern.panels.items()
-        for number, edge in enumerate(panel.edges)
-    }
+    pieces = {}  # of every edge
+    for key, panel in pattern.panels.items():
+        for number, edge in enumerate(panel.edges):
+            side, length = Side(key, number), edge_length(edge) / spacing
+            pieces[side] = 0 if length < _SHORT else max(round(length), 1 if side in sewn else 2)
     for seam in pattern.seams:
         pieces |= dict.fromkeys(seam.sides, max(pieces[side] for side in seam.sides))
     flat, placed, faces, owners, rows, count = [], [], [], [], {}, 0
@@ -87,11 +82,11 @@ def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> S
         owners.append(np.full(len(triangles), number))
         count += len(points)
     flat, placed, faces = np.concatenate(flat), np.concatenate(placed), np.concatenate(faces)
-    sides = [[rows[side] for side in seam.sides] for seam in pattern.seams]
-    pairs = [
-        (a, b if seam.is_parallel else b[::-1]) for (a, b), seam in zip(sides, pattern.seams, strict=True)
-    ]
-    first, second = (np.concatenate(rows) for rows in zip(*pairs, strict=True))
+    pairs = []
+    for seam in pattern.seams:
+        one, other = (rows[side] for side in seam.sides)
+        pairs.append((one, other if seam.is_parallel else other[::-1]))
+    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
     graph = scipy.sparse.coo_array((np.ones(len(first), bool), (first, second)), (count, count))
     num_joined, vertex = connected_components(graph, directed=False)
     totals = np.zeros((num_joined, 3))
@@ -137,11 +132,6 @@ def _gathered(
         corners[:, k] += shift
         corners[:, following] -= shift
     return corners
-
-
-def _num_pieces(length: float, least: int) -> int:
-    """Return in how many pieces an edge is divided, given its length over that of a piece."""
-    return 0 if length < _SHORT else max(round(length), least)
 
 
 def _divided(line: Float[np.ndarray, "points 2"], pieces: int) -> Float[np.ndarray, "_ 2"]:

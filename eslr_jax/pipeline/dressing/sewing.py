@@ -102,22 +102,20 @@ def sew_pattern(
     if made_for is not body:
         placed, lengths, worn_in, carried = carry_shape(draped, faces, posture, made_for, body, scale="body")
         corners, transfer = _recut(corners, draped[faces], lengths[faces]), {"transfer": carried}
-    rest, weights, indices, penetration = lay_to_rest(placed, faces, worn_in, body)
+    worn, penetration = lay_to_rest(placed, faces, worn_in, body)
     is_pinned, pinned_by, falling = choose_pins(
         pin,
-        np.zeros(len(rest), bool),
+        np.zeros(len(placed), bool),
         body,
-        positions=rest,
+        positions=worn["rest_positions"],
         faces=faces,
-        vertex_map=np.arange(len(rest)),
+        vertex_map=np.arange(len(placed)),
         face_parts=mesh.face_panels,
         part_names=tuple(pattern.panels),
     )
     return GarmentFile(
-        rest_positions=rest,
+        **worn,
         faces=faces,
-        skin_weights=weights,
-        skin_indices=indices,
         is_pinned=is_pinned,
         sewn_positions=placed,
         panel_corners=corners,
@@ -144,7 +142,6 @@ def sew_pattern(
 
 
 def _check_place(mesh: SewnMesh, pattern: Pattern, posture: Posture, name: str) -> None:
-    """Raise a MeshError if a panel does not stand around the body."""
     height = float(np.ptp(posture.positions[:, 1]))
     for number, panel in enumerate(pattern.panels):
         place = mesh.placed[np.unique(mesh.faces[mesh.face_panels == number])]
@@ -198,16 +195,12 @@ def _recut(
     new: Float[np.ndarray, "faces 3 3"],
 ) -> Float[np.ndarray, "faces 3 2"]:
     """Return the corners of flat faces [m], stretched as the faces of a shape in space are from old to new."""
-
-    def metric(points: np.ndarray) -> np.ndarray:
-        edges = np.stack([points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]], axis=2)
-        return edges.swapaxes(1, 2) @ edges
-
-    flat = np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
-    lower = np.linalg.cholesky(metric(old))
+    flat, before, after = map(_edges, (corners, old, new))
+    lower = np.linalg.cholesky(before.swapaxes(1, 2) @ before)
     inverse = np.linalg.inv(lower)
     # In the frame of the old face, whose edges are lower^T; its stretch is the root of the pulled-back metric.
-    values, vectors = np.linalg.eigh(inverse @ metric(new) @ inverse.swapaxes(1, 2))
+    metric = after.swapaxes(1, 2) @ after
+    values, vectors = np.linalg.eigh(inverse @ metric @ inverse.swapaxes(1, 2))
     root = vectors @ (np.sqrt(values)[:, :, None] * vectors.swapaxes(1, 2))
     turn = flat @ inverse.swapaxes(1, 2)  # from that frame to the panel's
     edges = turn @ root @ lower.swapaxes(1, 2)
@@ -317,12 +310,14 @@ def _heights(
 
 def _frames(mesh: SewnMesh) -> tuple[Float[np.ndarray, "faces 3 2"], Float[np.ndarray, " faces"]]:
     """Return what each corner adds to the columns of its face's deformation gradient [1/m], and areas [m2]."""
-    corners = mesh.panel_corners
-    edges = np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
-    inverse = np.linalg.inv(edges)
-    return np.concatenate([inverse, -inverse.sum(axis=1, keepdims=True)], axis=1), 0.5 * np.abs(
-        np.linalg.det(edges)
-    )
+    edges = _edges(mesh.panel_corners)
+    inverse, areas = np.linalg.inv(edges), 0.5 * np.abs(np.linalg.det(edges))
+    return np.concatenate([inverse, -inverse.sum(axis=1, keepdims=True)], axis=1), areas
+
+
+def _edges(corners: np.ndarray) -> np.ndarray:
+    """Return the two edges of every face that end in its last corner, as columns."""
+    return np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
 
 
 def stretches(mesh: SewnMesh, position: Positions) -> Float[np.ndarray, " faces"]:

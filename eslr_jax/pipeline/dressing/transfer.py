@@ -67,12 +67,10 @@ def transfer_garment(
     placed, sewn, posture, report = carry_shape(
         garment.rest_positions, garment.faces, rest_posture(source), source, target, scale=scale
     )
-    rest, weights, indices, _ = lay_to_rest(placed, garment.faces, posture, target)
+    worn, _ = lay_to_rest(placed, garment.faces, posture, target)
     return dataclasses.replace(
         garment,
-        rest_positions=rest,
-        skin_weights=weights,
-        skin_indices=indices,
+        **worn,
         sewn_positions=sewn,
         metadata=garment.metadata | wearer_entry(target) | {"transfer": report},
     )

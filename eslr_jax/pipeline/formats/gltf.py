@@ -75,12 +75,9 @@ def _add_mesh(builder: _Builder, mesh: AnimatedMesh, timestep: float) -> None:
         weights, indices = (array[vertices] for array in influences(mesh.skin))
         padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
         dtype = np.uint8 if len(mesh.skin.parents) <= np.iinfo(np.uint8).max else np.uint16
-        for name, values in (
-            ("JOINTS", np.pad(indices, padding).astype(dtype)),
-            ("WEIGHTS", np.pad(weights, padding).astype(np.float32)),
-        ):
-            for number in range(values.shape[1] // _INFLUENCES_PER_SET):
-                part = values[:, number * _INFLUENCES_PER_SET : (number + 1) * _INFLUENCES_PER_SET]
+        for name, values, kind in (("JOINTS", indices, dtype), ("WEIGHTS", weights, np.float32)):
+            padded = np.pad(values, padding).astype(kind)
+            for number, part in enumerate(np.split(padded, padded.shape[1] // _INFLUENCES_PER_SET, axis=1)):
                 setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
         skin = _add_skin(builder, mesh.name, mesh.skin, timestep)
     targets, weights = _add_targets(builder, base, offsets, faces, vertices)
@@ -120,7 +117,10 @@ def _add_targets(
     # The basis is orthonormal: what the first shapes leave of the normals is the sum of the others' squares.
     left = np.cumsum(np.sum(turned * turned, axis=(1, 2))[::-1])[::-1] / normals[..., 0].size
     num_turned = int(np.sum(left > _NORMAL_TOLERANCE**2))
-    still = builder.add_zeros(len(vertices)) if num_turned < len(shapes) else None
+    still = None
+    if num_turned < len(shapes):  # zeros, which take no room
+        zeros = gltf.Accessor(componentType=gltf.FLOAT, count=len(vertices), type=gltf.VEC3)
+        still = _append(builder.document.accessors, zeros)
     largest = np.abs(basis).max(0)
     targets = []
     for number, (shape, normal) in enumerate(zip(shapes, turned, strict=True)):
@@ -218,16 +218,10 @@ class _Builder:
         index = self.add_vertices(rounded, gltf.VEC3)
         accessor = self.document.accessors[index]
         accessor.normalized = True
-        accessor.min = rounded[:, :3].min(axis=0).tolist()
-        accessor.max = rounded[:, :3].max(axis=0).tolist()
+        accessor.min, accessor.max = (end(rounded[:, :3], axis=0).tolist() for end in (np.min, np.max))
         self.document.bufferViews[accessor.bufferView].byteStride = rounded.itemsize * rounded.shape[1]
         self.document.extensionsUsed = self.document.extensionsRequired = ["KHR_mesh_quantization"]
         return index
-
-    def add_zeros(self, num_vertices: int) -> int:
-        """Add vectors of zeros, which take no room."""
-        accessor = gltf.Accessor(componentType=gltf.FLOAT, count=num_vertices, type=gltf.VEC3)
-        return _append(self.document.accessors, accessor)
 
     def add_vertices(self, values: np.ndarray, kind: str) -> int:
         """Add other values per vertex, such as normals."""
@@ -242,7 +236,7 @@ class _Builder:
 
     def add_material(self, name: str, color: Color) -> int:
         """Append a rough two-sided material and return its index."""
-        linear = [float(value) for value in srgb_to_linear(color)]
+        linear = srgb_to_linear(color).tolist()
         surface = gltf.PbrMetallicRoughness(
             baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9
         )
@@ -284,6 +278,5 @@ class _Builder:
 
 
 def _append(items: list, item: object) -> int:
-    """Append and return the new item's index."""
     items.append(item)
     return len(items) - 1

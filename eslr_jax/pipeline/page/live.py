@@ -266,7 +266,6 @@ def _busy(live: Live, text: str) -> Iterator[None]:
 
 
 def _load(live: Live, choice: Choice) -> None:
-    """Put what is chosen on stage."""
     live.refused = choice  # until it is there
     with _busy(live, f"preparing {' and '.join(choice.garments)} on {choice.motion}"):
         rig = load_body(choice.body, betas=choice.betas)

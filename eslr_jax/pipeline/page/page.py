@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import threading
 import time
 from collections.abc import Sequence
@@ -79,8 +80,7 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
     gui = server.gui
     uplot = require("viser.uplot", extra="view")
     series = [uplot.Series(label="s")]
-    for number, run in enumerate(runs):
-        color = _CURVE_COLORS[number % len(_CURVE_COLORS)]
+    for run, color in zip(runs, itertools.cycle(_CURVE_COLORS), strict=False):
         series.append(uplot.Series(label=run.name, stroke=color, width=2))
     time = np.arange(num_frames) * runs[0].trajectory.timestep
     controls = {
@@ -241,7 +241,6 @@ def _curves(view: View, name: str) -> Float[np.ndarray, "runs frames"] | None:
 
 
 def _change_color(view: View) -> None:
-    """Show another field, and its plot."""
     curves, plot = _curves(view, view.controls["color"].value), view.controls["plot"]
     plot.visible = view.controls["worst"].visible = curves is not None
     if curves is not None:

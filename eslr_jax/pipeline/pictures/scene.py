@@ -178,7 +178,6 @@ def _studio(mitsuba: ModuleType, camera: Camera, ground_height: float) -> dict[s
 
 
 def _lit(mitsuba: ModuleType, surfaces: Sequence[Surface]) -> dict[str, Any]:
-    """Return matte meshes of surfaces."""
 
     def matte(scale: float) -> dict[str, Any]:
         color = {"type": "mesh_attribute", "name": "vertex_color", "scale": scale}

@@ -172,7 +172,6 @@ def _turns_of_frames(
 
 
 def _smallest_turn(start: NDArray, end: NDArray) -> NDArray:
-    """Return the smallest rotation of one direction to another, shape [3, 3]."""
     return Rotation.align_vectors(end[None], start[None])[0].as_matrix()
 
 
