@@ -9,6 +9,7 @@ A damaged file may crash the library, so that the script `apart/alembic.py` read
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -23,7 +24,7 @@ from eslr_jax.files.atomic import atomic_write
 from eslr_jax.files.npz import read_arrays
 from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, identifiers, vertex_normals
-from eslr_jax.pipeline.formats.mesh import MeshFile, cut_polygons, name_parts
+from eslr_jax.pipeline.formats.mesh import MeshFile, cut_polygons, join_meshes, name_parts
 from eslr_jax.pipeline.formats.mesh_sequence import DEFAULT_FPS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader, writer
 from eslr_jax.pose.skeleton import MAX_FRAMES, whole_rate
@@ -99,14 +100,12 @@ def read_alembic_garment(path: Path, names: str = "") -> MeshFile:
     """Read the first sample of all meshes, or of some, as one garment, whose parts are face sets or meshes."""
     arrays = _read(path, names, 1)
     meshes = [_mesh(arrays, number, path) for number in range(len(arrays["names"]))]
-    counts = np.cumsum([0, *(positions.shape[1] for positions, *_ in meshes)])
-    uvs = [uvs for _, _, uvs, _ in meshes if uvs is not None]
-    own = [str(name) for name, (_, faces, *_) in zip(arrays["names"], meshes, strict=True) for _ in faces]
-    face_parts, part_names = name_parts([[part for *_, parts in meshes for part in parts], own])
+    positions, faces, uvs, parts = zip(*meshes, strict=True)
+    own = [str(name) for name, own in zip(arrays["names"], faces, strict=True) for _ in own]
+    face_parts, part_names = name_parts([list(itertools.chain(*parts)), own])
     return MeshFile(
-        positions=np.concatenate([positions[0] for positions, *_ in meshes]),
-        faces=np.concatenate([faces + count for (_, faces, *_), count in zip(meshes, counts, strict=False)]),
-        corner_uvs=np.concatenate(uvs) if len(uvs) == len(meshes) else None,
+        *join_meshes([moving[0] for moving in positions], faces),
+        corner_uvs=None if any(one is None for one in uvs) else np.concatenate(uvs),
         face_parts=face_parts,
         part_names=part_names,
         name=names.replace(",", "_") or path.stem,

@@ -127,6 +127,21 @@ def _fan_starts(polygons: np.ndarray) -> np.ndarray:
     return starts
 
 
+def join_meshes(
+    positions: Sequence[np.ndarray], faces: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of several meshes as those of one."""
+    starts = np.cumsum([0, *map(len, positions)])[:-1]
+    moved = [own + start for own, start in zip(faces, starts, strict=True)]
+    return np.concatenate(positions), np.concatenate(moved)
+
+
+def stack_tables(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Return tables below each other; those with fewer columns get columns of zeros."""
+    width = max(table.shape[1] for table in tables)
+    return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])
+
+
 def name_parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Return each face's part, and the names, from the first list of names that tells faces apart."""
     for names in choices:
