@@ -127,26 +127,21 @@ def fit_garment(
         )
         transfer = {"transfer": carried}
     worn, penetration = lay_to_rest(placed, faces, worn_in, body, is_pushed=options.push_out)
-    is_pinned, pinned_by, falling = choose_pins(
-        options.pin,
-        file_pins,
-        body,
-        positions=worn["rest_positions"],
-        faces=faces,
-        vertex_map=vertex_map,
-        face_parts=parts,
-        part_names=mesh.part_names,
-    )
-    return GarmentFile(
+    garment = GarmentFile(
         **worn,
         faces=faces,
-        is_pinned=is_pinned,
+        is_pinned=file_pins,
         sewn_positions=sewn,
         corner_uvs=uvs,
         face_parts=parts,
         part_names=mesh.part_names,
         vertex_map=vertex_map,
         joined_rows=joined_rows,
+    )
+    is_pinned, pinned_by, falling = choose_pins(options.pin, garment, body)
+    return dataclasses.replace(
+        garment,
+        is_pinned=is_pinned,
         metadata={
             "name": name,
             **wearer_entry(body),

@@ -103,25 +103,20 @@ def sew_pattern(
         placed, lengths, worn_in, carried = carry_shape(draped, faces, posture, made_for, body, scale="body")
         corners, transfer = _recut(corners, draped[faces], lengths[faces]), {"transfer": carried}
     worn, penetration = lay_to_rest(placed, faces, worn_in, body)
-    is_pinned, pinned_by, falling = choose_pins(
-        pin,
-        np.zeros(len(placed), bool),
-        body,
-        positions=worn["rest_positions"],
-        faces=faces,
-        vertex_map=np.arange(len(placed)),
-        face_parts=mesh.face_panels,
-        part_names=tuple(pattern.panels),
-    )
-    return GarmentFile(
+    garment = GarmentFile(
         **worn,
         faces=faces,
-        is_pinned=is_pinned,
+        is_pinned=np.zeros(len(placed), bool),
         sewn_positions=placed,
         panel_corners=corners,
         corner_uvs=_laid_out(mesh.face_panels, corners),
         face_parts=mesh.face_panels,
         part_names=tuple(pattern.panels),
+    )
+    is_pinned, pinned_by, falling = choose_pins(pin, garment, body)
+    return dataclasses.replace(
+        garment,
+        is_pinned=is_pinned,
         metadata={
             "name": name,
             **wearer_entry(body),

@@ -67,7 +67,7 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
 
 def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
     """Add a mesh: bound to a skeleton where that moves it exactly, as points otherwise."""
-    from pxr import Sdf, UsdGeom, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
+    from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
 
     positions, rest, skin = np.asarray(mesh.positions, np.float32), mesh.rest_positions, mesh.skin
     if skin is not None and rest is not None and corrections(skin, rest, positions, TOLERANCE) is not None:
@@ -92,35 +92,23 @@ def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
         primvar = UsdGeom.PrimvarsAPI(prim.GetPrim()).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
         primvar.Set(Vt.Vec2fArray.FromNumpy(uvs))
     _add_material(stage, f"{path}_material", mesh.color, prim)
-    if skin is not None:
-        _set_points(prim, np.asarray(rest, np.float32), faces)
-        _bind(stage, path, prim, skin)
-        return
-    for frame, points in enumerate(positions):
-        velocities = None if mesh.velocities is None else mesh.velocities[frame]
-        _set_points(prim, points, faces, velocities, frame)
-
-
-def _set_points(
-    prim: Any,
-    points: np.ndarray,
-    faces: np.ndarray,
-    velocities: np.ndarray | None = None,
-    frame: int | None = None,
-) -> None:
-    """Set points [m], normals, velocities [m/s] and bounds of a frame, or of all time."""
-    from pxr import Usd, Vt  # pyright: ignore[reportMissingImports]
-
-    time = Usd.TimeCode.Default() if frame is None else Usd.TimeCode(frame)
 
     def vectors(values: np.ndarray) -> Any:
         return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
-    prim.CreatePointsAttr().Set(vectors(points), time)
-    prim.CreateNormalsAttr().Set(vectors(vertex_normals(points, faces)), time)
-    prim.CreateExtentAttr().Set(vectors(np.stack([points.min(axis=0), points.max(axis=0)])), time)
-    if velocities is not None:
-        prim.CreateVelocitiesAttr().Set(vectors(velocities), time)
+    def set_points(points: np.ndarray, time: Any) -> None:
+        prim.CreatePointsAttr().Set(vectors(points), time)
+        prim.CreateNormalsAttr().Set(vectors(vertex_normals(points, faces)), time)
+        prim.CreateExtentAttr().Set(vectors(np.stack([points.min(axis=0), points.max(axis=0)])), time)
+
+    if skin is not None:
+        set_points(np.asarray(rest, np.float32), Usd.TimeCode.Default())
+        _bind(stage, path, prim, skin)
+        return
+    for frame, points in enumerate(positions):
+        set_points(points, Usd.TimeCode(frame))
+        if mesh.velocities is not None:
+            prim.CreateVelocitiesAttr().Set(vectors(mesh.velocities[frame]), frame)
 
 
 def _add_material(stage: Any, path: str, color: Color, prim: Any) -> None:

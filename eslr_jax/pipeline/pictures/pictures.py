@@ -115,23 +115,15 @@ def render_frame(
     body_faces: np.ndarray | None,
     garment_positions: np.ndarray,
     garment_faces: np.ndarray,
-    *,
-    vertex_colors: np.ndarray | None = None,
     **options: Any,
 ) -> np.ndarray:
     """Render one picture, [height, width, 3].
 
     Arguments and errors are those of `render_frames`; positions and colours have no axis of frames.
     """
-    frames = render_frames(
-        None if body_positions is None else np.asarray(body_positions)[None],
-        body_faces,
-        np.asarray(garment_positions)[None],
-        garment_faces,
-        vertex_colors=vertex_colors,
-        **options,
-    )
-    return next(frames)
+    body = None if body_positions is None else np.asarray(body_positions)[None]
+    cloth = np.asarray(garment_positions)[None]
+    return next(render_frames(body, body_faces, cloth, garment_faces, **options))
 
 
 def contact_sheet(
@@ -165,17 +157,9 @@ def contact_sheet(
         )
     last = len(garment_positions) - 1
     indices = sorted({round(frame) for frame in np.linspace(0, last, num_frames)})
-    frames = render_frames(
-        body_positions,
-        body_faces,
-        garment_positions,
-        garment_faces,
-        frame_indices=indices,
-        size=size,
-        **options,
-    )
+    meshes = (body_positions, body_faces, garment_positions, garment_faces)
     pictures = []
-    for picture in frames:
+    for picture in render_frames(*meshes, frame_indices=indices, size=size, **options):
         pictures.append(picture)
         if on_picture is not None:
             on_picture(len(pictures), len(indices))
