@@ -62,26 +62,13 @@ _RAYS, _RINGS, _RING = 24, 30, 0.01  # directions, and steps [m], in which a pla
 
 
 def sew_pattern(
-    pattern: Pattern,
-    body: Body,
-    made_for: Body,
-    *,
-    num_vertices: int = 1000,
-    pin: tuple[str, ...] = (),
-    name: str = "pattern",
+    pattern: Pattern, body: Body, made_for: Body, *, num_vertices: int, pin: tuple[str, ...], name: str
 ) -> GarmentFile:
     """Cut a pattern's panels, sew them around the body that they are made for, and carry the garment to a body.
 
-    Args:
-        pattern: Panels that stand around a body whose feet are at the origin.
-        body: Who wears the garment.
-        made_for: The body that the pattern is made for; the same object if that is the wearer.
-        num_vertices: About how many vertices the garment is to have.
-        pin: Vertices that follow the body, see `FitOptions.pin`; a panel is a part.
-        name: Name of the garment in messages.
-
-    Returns:
-        The garment; `metadata["sewing"]` reports on it and holds the vertices of every seam.
+    The panels stand around a body whose feet are at the origin, `made_for`, which is the same object if it is the
+    wearer. The garment has about `num_vertices`; `pin` is that of `FitOptions`, a panel a part.
+    `metadata["sewing"]` reports on it and holds the vertices of every seam. Messages say its `name`.
 
     Raises:
         MeshError: The panels stand elsewhere, can't be cut or joined, or can't be carried to the body.

@@ -143,7 +143,7 @@ def pose_alike(body: Body, skeleton: Skeleton) -> Posture:
                 )
     ours = {part: joints for part, joints in ours.items() if part in theirs}
     try:
-        turned = align_rests(own, skeleton, ours, theirs, "of the garment")
+        turned = align_rests(own, skeleton, ours, theirs)
     except MotionError as error:
         raise MeshError(
             "no garment can be carried to a body that does not stand at rest; export it in a T-pose or A-pose"

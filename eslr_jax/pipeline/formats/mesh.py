@@ -77,12 +77,8 @@ def cut_polygons(
     if both will do, other polygons from their first such corner. So is a polygon with next to no area, in which
     rounding decides where triangles look.
 
-    Args:
-        points: Vertices [vertices, 3].
-        sizes: Number of corners of each polygon, three or more.
-        corners: Vertex of each corner, polygon after polygon.
-        starts: Corner from which each polygon was cut in another shape of the mesh; another number of them is
-            left out.
+    Polygons have three or more corners each, `sizes`, whose vertices follow each other in `corners`. `starts` are
+    the corners from which they were cut in another shape of the mesh; another number of them is left out.
 
     Returns:
         Triangles as places among the corners [triangles, 3]; the polygon of each triangle; and the corner from

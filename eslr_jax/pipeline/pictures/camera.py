@@ -65,13 +65,11 @@ def follow(
     zoom: float = 1.0,
     focus: Float[np.ndarray, "frames points 3"] | None = None,
 ) -> tuple[list[Camera], float]:
-    """Place a camera per frame that keeps the subject in the middle, and sees all of it, at one distance.
+    """Return a camera per frame that sees the whole subject [m], in the middle, at one distance; and the floor.
 
     `angles` are directions of the camera around +Y, from +Z towards +X [rad], `aspect` is picture width over
-    height. `focus` are points whose centre is looked at [m], by default the subject's.
-
-    Returns:
-        A camera per frame, and the height of the floor: the lowest point over all frames [m].
+    height. `focus` are points whose centre is looked at [m], by default the subject's. The floor is the height of
+    the lowest point over all frames [m].
     """
     floor, top = float(subject[..., 1].min()), float(subject[..., 1].max())
     centers = subject.mean(axis=1)

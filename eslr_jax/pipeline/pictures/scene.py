@@ -79,17 +79,10 @@ def trace_picture(
     size: tuple[int, int],
     samples: int,
 ) -> np.ndarray:
-    """Trace one picture; the lights turn with the camera.
+    """Trace one picture, sRGB, uint8, shape [height, width, 3]; the lights turn with the camera.
 
-    Args:
-        surfaces: What stands in the studio.
-        camera: Where to look from.
-        ground_height: Height of the floor [m].
-        size: Width and height [pixels].
-        samples: Camera rays per pixel, rounded up to a square number.
-
-    Returns:
-        sRGB picture, uint8, shape [height, width, 3].
+    The floor has a height [m], the picture a width and height [pixels]; camera rays per pixel, `samples`, are
+    rounded up to a square number.
     """
     mitsuba = require("mitsuba")
     with _variant(mitsuba):

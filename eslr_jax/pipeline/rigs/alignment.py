@@ -64,25 +64,13 @@ def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float 
 
 
 def align_rests(
-    target: Skeleton,
-    source: Skeleton,
-    ours: Parts,
-    theirs: Parts,
-    name: str,
-    motion: SkeletonMotion | None = None,
+    target: Skeleton, source: Skeleton, ours: Parts, theirs: Parts, motion: SkeletonMotion | None = None
 ) -> NDArray:
     """Return the rotation from the body's rest pose to the source's for each joint, shape [joints, 3, 3].
 
     A limb turns as little as lays the body's bone along the source's. If the source's legs do not stand at rest,
-    as when all bones lie along one axis, the frames of its motion decide; see `_turns_of_frames`.
-
-    Args:
-        target: Joints of the body.
-        source: Joints of the source.
-        ours: Joints of the body by part; see `match_parts`.
-        theirs: Joints of the source by part.
-        name: What messages call the source.
-        motion: Of the source, Y up; None if it does not move.
+    as when all bones lie along one axis, the frames of its motion, Y up, decide; see `_turns_of_frames`. `ours`
+    and `theirs` are the joints of each part; see `match_parts`.
 
     Raises:
         MotionError: The source's legs stand neither at rest nor in a frame.
@@ -90,17 +78,10 @@ def align_rests(
     upright = _torso_turn(target, ours, source, theirs)
     limbs = _find_limbs(target, source, ours, theirs)
     turns = {part: _smallest_turn(upright @ bone, end) @ upright for part, (bone, end) in limbs.items()}
-    lying = [
-        part
-        for part, (bone, end) in limbs.items()
-        if part[1] in _LEG and _angle_between(upright @ bone, end) > MAX_LEG_TURN
-    ]
-    if lying:
+    legs = [limb for part, limb in limbs.items() if part[1] in _LEG]
+    if any(_angle_between(upright @ bone, end) > MAX_LEG_TURN for bone, end in legs):
         if motion is None:
-            raise MotionError(
-                f"{name}: its rest pose does not stand ({' '.join(lying[0])} points elsewhere); "
-                "export it with a T-pose at rest"
-            )
+            raise MotionError("the rest pose of a skeleton does not stand; export it with a T-pose at rest")
         turns = _turns_of_frames(limbs, theirs, upright, motion)
     result = np.tile(upright, (len(target), 1, 1))
     continued = {"forearm": HAND, "foot": ("toe",)}

@@ -224,7 +224,7 @@ def make_motion(
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
     if scale is None:
-        alignments = align_rests(target, source.skeleton, ours, theirs, source.name, source)
+        alignments = align_rests(target, source.skeleton, ours, theirs, source)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
         if other >= 0:
