@@ -12,8 +12,7 @@ from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.formats.animated import Skin, check_moving
 from eslr_jax.pipeline.formats.palette import GARMENT_COLORS
 from eslr_jax.pipeline.pictures.annotate import side_by_side
-from eslr_jax.pipeline.pictures.camera import facing_angles, follow, parse_angle
-from eslr_jax.pipeline.pictures.scene import Surface, trace_picture
+from eslr_jax.pipeline.pictures.scene import Surface, facing_angles, follow, parse_angle, trace_picture
 from eslr_jax.pipeline.rigs.clothing import body_pieces
 from eslr_jax.types import Body
 
