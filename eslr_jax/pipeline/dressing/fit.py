@@ -11,21 +11,13 @@ import numpy as np
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.topology import face_areas, undirected_edges, vertex_components
 from eslr_jax.mesh.validate import check_arrays, validate_mesh
+from eslr_jax.pipeline.dressing import repair
 from eslr_jax.pipeline.dressing.clearance import lay_to_rest
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.pins import choose_pins
 from eslr_jax.pipeline.dressing.placement import find_placement
 from eslr_jax.pipeline.dressing.postures import arm_postures, rest_posture
 from eslr_jax.pipeline.dressing.remesh import remesh
-from eslr_jax.pipeline.dressing.repair import (
-    Cleaned,
-    consistent_orientation,
-    join_components,
-    largest_component,
-    shares_along_seams,
-    shell_thickness,
-    weld,
-)
 from eslr_jax.pipeline.dressing.report import describe_cost, wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape
 from eslr_jax.pipeline.formats.garment import GarmentFile, first_rows
@@ -89,14 +81,14 @@ def fit_garment(
     posture = postures[placement.posture]
     clean = dataclasses.replace(clean, positions=placement.apply(clean.positions))
     clean, joined, doubts = _join(clean, options)
-    thickness = shell_thickness(clean.positions, clean.faces)
+    thickness = repair.shell_thickness(clean.positions, clean.faces)
     if thickness is not None:
         doubts.append(
             f"it is a closed shell with two sides {1e3 * thickness:.1f} mm apart, which is stiff as foam; "
             "export a single layer (thin, without thickness)"
         )
     # Faces are turned that disagree with neighbours, and parts that face the body.
-    turn = consistent_orientation(clean.positions, clean.faces)
+    turn = repair.consistent_orientation(clean.positions, clean.faces)
     is_turned = turn ^ posture.is_turned_in(clean.positions, _turn(clean.faces, turn))
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
@@ -168,9 +160,11 @@ def fit_garment(
     )
 
 
-def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
+def _clean(
+    positions: np.ndarray, faces: np.ndarray, options: FitOptions
+) -> tuple[repair.Cleaned, dict[str, Any]]:
     """Weld open edges; return the mesh and a report."""
-    clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
+    clean = repair.weld(positions, faces.astype(np.int64), tolerance=options.weld)
     if not face_areas(clean.positions, clean.faces).sum() > 0:
         raise MeshError(
             "no face with an area is left after welding coincident vertices; check the mesh, or give eslr fit a "
@@ -187,12 +181,12 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
     }
 
 
-def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any], list[str]]:
+def _join(clean: repair.Cleaned, options: FitOptions) -> tuple[repair.Cleaned, dict[str, Any], list[str]]:
     """Join or drop separate parts as the options say; positions are in metres. Return report and warnings."""
     chosen, doubts = options.components, []
     if chosen == "auto":
         gaps = (min(_SEAM, options.join_gap), options.join_gap)
-        shares = shares_along_seams(clean.positions, clean.faces, gaps)
+        shares = repair.shares_along_seams(clean.positions, clean.faces, gaps)
         is_open, is_near = (share > _ALONG for share in shares)
         chosen = "join" if is_open else "keep"
         if is_near:
@@ -204,9 +198,9 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any],
     if chosen not in ("join", "largest"):
         return clean, {}, doubts
     if chosen == "join":
-        step = join_components(clean.positions, clean.faces, options.join_gap)
+        step = repair.join_components(clean.positions, clean.faces, options.join_gap)
     else:
-        step = largest_component(clean.positions, clean.faces)
+        step = repair.largest_component(clean.positions, clean.faces)
     if options.components == "auto" and undirected_edges(step.faces)[2].max() > 2:
         return clean, {}, doubts  # an edge of three pieces, such as a pocket's on a seam
     onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1

@@ -13,15 +13,8 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax.mesh import topology
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.topology import (
-    boundary_loops,
-    face_areas,
-    face_cross_products,
-    find_hinges,
-    half_edges,
-    undirected_edges,
-)
 from eslr_jax.mesh.validate import validate_mesh
 from eslr_jax.pipeline.dressing.repair import consistent_orientation
 from eslr_jax.pipeline.extras import require
@@ -44,7 +37,7 @@ def remesh(
         MeshError: No clustering gave a clean mesh.
         MissingExtraError: The extra `remesh` is not installed.
     """
-    area = float(face_areas(positions, faces).sum())
+    area = float(topology.face_areas(positions, faces).sum())
     # Of equilateral triangles, two per vertex, each with the area sqrt(3) / 4 of its squared edge.
     count = round(area / (np.sqrt(3.0) / 2.0 * edge_length**2)) if edge_length > 0 else 0
     if not _MIN_VERTICES <= count <= _MAX_VERTICES:
@@ -69,7 +62,8 @@ def remesh(
                 triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
                 nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
                 agreement = np.sum(
-                    face_cross_products(points, triangles) * face_cross_products(positions, faces)[nearest]
+                    topology.face_cross_products(points, triangles)
+                    * topology.face_cross_products(positions, faces)[nearest]
                 )
                 triangles = triangles if agreement > 0 else np.ascontiguousarray(triangles[:, ::-1])
                 points = _onto_open_edges(points, triangles, positions, faces)
@@ -87,9 +81,9 @@ def _onto_open_edges(
     points: np.ndarray, triangles: np.ndarray, positions: np.ndarray, faces: np.ndarray
 ) -> np.ndarray:
     """Move boundary vertices to the closest point of the source's nearest open edge."""
-    loops = [positions[loop] for loop in boundary_loops(faces)]
+    loops = [positions[loop] for loop in topology.boundary_loops(faces)]
     result = points.copy()
-    for loop in boundary_loops(triangles) if loops else []:
+    for loop in topology.boundary_loops(triangles) if loops else []:
         distances = [cKDTree(other).query(points[loop])[0].mean() for other in loops]
         start = loops[int(np.argmin(distances))]
         end = np.roll(start, -1, axis=0)
@@ -158,7 +152,7 @@ def _smoothed(
 
 def _quadruple(faces: np.ndarray, count: int) -> Refinement:
     """Split every face in four."""
-    edges, behind, counts = undirected_edges(faces)
+    edges, behind, counts = topology.undirected_edges(faces)
     is_boundary = counts == 1
     a, b, c = faces.T
     ab, bc, ca = count + behind.reshape(-1, 3).T
@@ -167,7 +161,7 @@ def _quadruple(faces: np.ndarray, count: int) -> Refinement:
     )
     shape, ends = (len(edges), count), (np.arange(len(edges)).repeat(2), edges.ravel())
     near = csr_matrix((np.where(is_boundary, 0.5, 0.375).repeat(2), ends), shape)
-    opposite = half_edges(faces)[2]
+    opposite = topology.half_edges(faces)[2]
     across = csr_matrix((np.where(is_boundary, 0.0, 0.125)[behind], (behind, opposite)), shape)
 
     def share(degree: np.ndarray) -> np.ndarray:
@@ -183,9 +177,9 @@ def _quadruple(faces: np.ndarray, count: int) -> Refinement:
 
 def _triple(faces: np.ndarray, count: int) -> Refinement:
     """Put a vertex into every face, and turn the inner edges to join two of these."""
-    edges, behind, counts = undirected_edges(faces)
-    starts, ends, _ = half_edges(faces)
-    hinges, sides = find_hinges(faces)
+    edges, behind, counts = topology.undirected_edges(faces)
+    starts, ends, _ = topology.half_edges(faces)
+    hinges, sides = topology.find_hinges(faces)
     (low, high), (left, right) = hinges[:, :2].T, sides.T
     rim = np.flatnonzero(counts[behind] == 1)
     finer = np.concatenate(

@@ -17,16 +17,7 @@ import numpy as np
 import pygltflib as gltf
 
 from eslr_jax.files.atomic import atomic_write
-from eslr_jax.pipeline.formats.animated import (
-    AnimatedMesh,
-    Skin,
-    corrections,
-    influences,
-    local_motion,
-    principal_shapes,
-    split_seams,
-    vertex_normals,
-)
+from eslr_jax.pipeline.formats import animated
 from eslr_jax.pipeline.formats.palette import Color, srgb_to_linear
 from eslr_jax.pipeline.formats.registry import writer
 
@@ -44,7 +35,7 @@ _COMPONENT_TYPES = {
 
 
 @writer("scene", [".glb"])
-def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
+def write_animated_glb(path: str | Path, meshes: Sequence[animated.AnimatedMesh], timestep: float) -> None:
     """Write meshes with their animation as one GLB file, atomically; frame k is at k times the timestep [s]."""
     builder = _Builder()
     for mesh in meshes:
@@ -54,25 +45,25 @@ def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timeste
         temporary.write_bytes(content)
 
 
-def _add_mesh(builder: _Builder, mesh: AnimatedMesh, timestep: float) -> None:
+def _add_mesh(builder: _Builder, mesh: animated.AnimatedMesh, timestep: float) -> None:
     """Add a mesh with its skin, its morph targets and their animation."""
     positions, faces = np.asarray(mesh.positions, np.float32), np.asarray(mesh.faces)
     base, offsets = positions[0], positions - positions[0]
     if mesh.skin is not None:
         base = np.asarray(mesh.rest_positions, np.float32)
-        needed = corrections(mesh.skin, base, positions, TOLERANCE)
+        needed = animated.corrections(mesh.skin, base, positions, TOLERANCE)
         offsets = np.zeros((len(positions), 0, 3)) if needed is None else needed
-    split, vertices, uvs = split_seams(faces, len(base), mesh.corner_uvs)
+    split, vertices, uvs = animated.split_seams(faces, len(base), mesh.corner_uvs)
     attributes = gltf.Attributes(
         POSITION=builder.add_points(base[vertices]),
-        NORMAL=builder.add_vertices(vertex_normals(base, faces)[vertices], gltf.VEC3),
+        NORMAL=builder.add_vertices(animated.vertex_normals(base, faces)[vertices], gltf.VEC3),
     )
     if uvs is not None:
         flipped = uvs * [1, -1] + [0, 1]  # glTF counts v from the top
         attributes.TEXCOORD_0 = builder.add_vertices(flipped.astype(np.float32), gltf.VEC2)
     skin = None
     if mesh.skin is not None:
-        weights, indices = (array[vertices] for array in influences(mesh.skin))
+        weights, indices = (array[vertices] for array in animated.influences(mesh.skin))
         padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
         dtype = np.uint8 if len(mesh.skin.parents) <= np.iinfo(np.uint8).max else np.uint16
         for name, values, kind in (("JOINTS", indices, dtype), ("WEIGHTS", weights, np.float32)):
@@ -110,9 +101,9 @@ def _add_targets(
     """
     if not offsets.size:
         return [], np.zeros((len(offsets), 0), np.float32)
-    basis, shapes = principal_shapes(offsets, TOLERANCE)
-    rest = vertex_normals(base, faces)
-    normals = np.stack([vertex_normals(base + offset, faces) - rest for offset in offsets])
+    basis, shapes = animated.principal_shapes(offsets, TOLERANCE)
+    rest = animated.vertex_normals(base, faces)
+    normals = np.stack([animated.vertex_normals(base + offset, faces) - rest for offset in offsets])
     turned = np.tensordot(basis, normals, axes=(0, 0))
     # The basis is orthonormal: what the first shapes leave of the normals is the sum of the others' squares.
     left = np.cumsum(np.sum(turned * turned, axis=(1, 2))[::-1])[::-1] / normals[..., 0].size
@@ -139,9 +130,9 @@ def _add_targets(
     return targets, (basis / largest).astype(np.float32)
 
 
-def _add_skin(builder: _Builder, name: str, skin: Skin, timestep: float) -> int:
+def _add_skin(builder: _Builder, name: str, skin: animated.Skin, timestep: float) -> int:
     """Add one animated node per joint under a common root, and return the skin that binds them."""
-    rotations, translations = local_motion(skin)
+    rotations, translations = animated.local_motion(skin)
     parents, first = list(skin.parents), len(builder.document.nodes)
     for joint, label in enumerate(skin.joint_names):
         node = gltf.Node(
