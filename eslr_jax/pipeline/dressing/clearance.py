@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.skinning import smooth, transfer_skin_weights
-from eslr_jax.pipeline.dressing.postures import Posture, rest_posture, unpose
+from eslr_jax.pipeline.dressing.postures import Posture, blend, rest_posture
 from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.types import Body
 
@@ -107,6 +107,8 @@ def lay_to_rest(
     )
     rest = clear
     if not np.array_equal(posture.transforms, np.broadcast_to(np.eye(3, 4), posture.transforms.shape)):
-        rest = unpose(clear, weights, indices, posture.transforms)
+        # What blended maps take to the posed positions.
+        blended = blend(weights, indices, posture.transforms)
+        rest = np.linalg.solve(blended[:, :, :3], (clear - blended[:, :, 3])[:, :, None])[:, :, 0]
         rest = push_out(rest, faces, rest_posture(body))[0] if is_pushed else rest
     return {"rest_positions": rest, "skin_weights": weights, "skin_indices": indices}, penetration

@@ -72,7 +72,7 @@ def fit_garment(
     if text and options.edge_length is None:  # else it is remeshed, and its size is chosen
         warnings.warn(text, stacklevel=2)
     worn_by = body if made_for is None else made_for
-    clean, report = _clean(mesh.positions, mesh.faces, options)
+    clean, report = _clean(mesh, options)
     postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
     facing = chest_direction(worn_by)
     placement = find_placement(
@@ -160,23 +160,20 @@ def fit_garment(
     )
 
 
-def _clean(
-    positions: np.ndarray, faces: np.ndarray, options: FitOptions
-) -> tuple[repair.Cleaned, dict[str, Any]]:
-    """Weld open edges; return the mesh and a report."""
-    clean = repair.weld(positions, faces.astype(np.int64), tolerance=options.weld)
+def _clean(mesh: MeshFile, options: FitOptions) -> tuple[repair.Cleaned, dict[str, Any]]:
+    clean = repair.weld(mesh.positions, mesh.faces.astype(np.int64), tolerance=options.weld)
     if not face_areas(clean.positions, clean.faces).sum() > 0:
         raise MeshError(
             "no face with an area is left after welding coincident vertices; check the mesh, or give eslr fit a "
             "smaller --weld"
         )
-    num_used = len(np.unique(faces))
+    num_used = len(np.unique(mesh.faces))
     return clean, {
-        "source_vertices": len(positions),
-        "source_faces": len(faces),
-        "loose_vertices": len(positions) - num_used,
+        "source_vertices": len(mesh.positions),
+        "source_faces": len(mesh.faces),
+        "loose_vertices": len(mesh.positions) - num_used,
         "welded_vertices": num_used - len(clean.positions),
-        "dropped_faces": len(faces) - len(clean.faces),
+        "dropped_faces": len(mesh.faces) - len(clean.faces),
         "components": vertex_components(clean.faces, len(clean.positions))[0],
     }
 

@@ -104,12 +104,7 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
     )
 
 
-def _move_over(
-    positions: Positions,
-    faces: Faces,
-    inner: Float[np.ndarray, "inner_vertices 3"],
-    inner_faces: Int[np.ndarray, "inner_faces 3"],
-) -> Positions:
+def _move_over(positions: Positions, faces: Faces, inner: np.ndarray, inner_faces: np.ndarray) -> Positions:
     """Return a layer with its vertices moved out over another one, and its faces off that one's vertices."""
     result = positions.copy()
     for _ in range(_ROUNDS):

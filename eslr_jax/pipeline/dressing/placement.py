@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from eslr_jax.errors import MeshError
 from eslr_jax.mesh.topology import boundary_loops, face_areas, vertex_areas
@@ -159,8 +159,7 @@ def find_placement(
             f"the place is doubtful (confidence {confidence:.0%}): {' and '.join(doubts)}; look at the picture, "
             "and give eslr fit --units, --up, --front or --keep-place, or the body that it was made for"
         )
-    pierced = count_pierced(sample, best.bones(postures[best.posture]), postures[best.posture].is_limb)
-    if pierced:
+    if pierced := count_pierced(sample, best, postures[best.posture]):
         warnings.append(
             f"{pierced} limbs of the body pierce the cloth: it was made for another body or pose; give eslr fit "
             "--made-for that body (for SMPL's garments a SMPL model)"
@@ -193,8 +192,7 @@ def _choose(
     for candidate in sorted(candidates, key=lambda placement: placement.cost):
         if rival is not None and candidate.cost > rival.cost:
             break
-        posture = postures[candidate.posture]
-        extra = wearing_cost(sample, candidate.apply(sample.points), candidate.bones(posture), posture)
+        extra = wearing_cost(sample, candidate, postures[candidate.posture])
         done.append(dataclasses.replace(candidate, cost=candidate.cost + extra))
         best = min(done, key=lambda placement: placement.cost)
         rivals = [other for other in done if _is_rival(best, other, sample)]
@@ -220,9 +218,7 @@ def _is_poor(best: Placement, sample: Sample, postures: list[Posture]) -> bool:
     posture = postures[best.posture]
     heights = posture.heights(best.apply(sample.points))
     is_off = np.mean(heights < -DEEP) > _LIMBS_INSIDE or np.mean(np.abs(heights) < _NEAR) < _MIN_NEAR
-    return (
-        best.cost > _POOR or bool(is_off) or count_pierced(sample, best.bones(posture), posture.is_limb) > 0
-    )
+    return best.cost > _POOR or bool(is_off) or count_pierced(sample, best, posture) > 0
 
 
 def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture]) -> list[Placement]:
@@ -374,29 +370,16 @@ def fit_cost(points: Float[np.ndarray, "points 3"], posture: Posture) -> float:
     return float(misfit + _SUPPORT * support + _BELOW_FLOOR * below)
 
 
-def count_pierced(
-    sample: Sample, bones: Float[np.ndarray, "bones 2 3"], is_limb: Bool[np.ndarray, " bones"]
-) -> int:
-    """Return how many limbs pierce the cloth, given bones in the file's coordinates.
-
-    The start of a limb does not count: it lies beside the edge of an armhole.
-    """
-    limbs = bones[is_limb]
+def count_pierced(sample: Sample, placement: Placement, posture: Posture) -> int:
+    """Return how many limbs pierce the placed cloth, without their starts, which lie at armholes."""
+    limbs = placement.bones(posture)[posture.is_limb]
     return int(np.sum(_crosses(limbs + _ARMHOLE * (limbs[:, ::-1] - limbs) * [[1], [0]], sample.cloth)))
 
 
-def wearing_cost(
-    sample: Sample,
-    points: Float[np.ndarray, "points 3"],
-    bones: Float[np.ndarray, "bones 2 3"],
-    posture: Posture,
-) -> float:
-    """Return the cost of a garment that is not worn: pierced by limbs, around no bone, or slipping down.
-
-    Its points are given as placed on the posture [m], and the posture's bones in the file's coordinates.
-    """
-    pierced = count_pierced(sample, bones, posture.is_limb)
-    is_empty = len(sample.openings) > 0 and not _crosses(bones, sample.openings).any()
+def wearing_cost(sample: Sample, placement: Placement, posture: Posture) -> float:
+    """Return the cost of a garment that is not worn: pierced by limbs, around no bone, or slipping down."""
+    points, pierced = placement.apply(sample.points), count_pierced(sample, placement, posture)
+    is_empty = len(sample.openings) > 0 and not _crosses(placement.bones(posture), sample.openings).any()
     now, lower = (_inside(posture.heights(points - [0.0, drop, 0.0])).mean() for drop in (0.0, _DROP))
     slips = 1.0 - np.clip((lower - now) / _HELD, 0.0, 1.0)
     return float(_PIERCED * pierced + _EMPTY * is_empty + _SLIPS * slips)

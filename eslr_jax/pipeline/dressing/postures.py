@@ -126,7 +126,7 @@ def arm_postures(body: Body) -> list[Posture]:
     postures = [rest_posture(body)]
     for transforms, angle in zip(np.asarray(turned, np.float64), angles, strict=True):
         weights = np.asarray(body.skin_weights, np.float64)
-        blended = _blend(weights, np.asarray(body.skin_indices), transforms)
+        blended = blend(weights, np.asarray(body.skin_indices), transforms)
         posed = np.einsum("vxy,vy->vx", blended[:, :, :3], postures[0].positions) + blended[:, :, 3]
         postures.append(take_posture(body, posed, transforms, angle))
     return postures
@@ -169,27 +169,13 @@ def shoulder_height(body: Body) -> float:
     return float(heights.min() + SHOULDERS * np.ptp(heights[~is_aside]))  # without raised arms
 
 
-def unpose(
-    positions: Positions,
-    skin_weights: Float[np.ndarray, "vertices influences"],
-    skin_indices: Int[np.ndarray, "vertices influences"],
-    transforms: Float[np.ndarray, "joints 3 4"],
-) -> Positions:
-    """Undo linear blend skinning: return the rest positions that blended maps take to posed positions [m]."""
-    blended = _blend(skin_weights, skin_indices, transforms)
-    return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]
-
-
-def _blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+def blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> np.ndarray:
     """Return the blended map of every vertex, shape [vertices, 3, 4]."""
     return np.einsum("vi,vixy->vxy", weights, transforms[indices])
 
 
 def take_posture(
-    body: Body,
-    positions: Float[np.ndarray, "body_vertices 3"],
-    transforms: Float[np.ndarray, "joints 3 4"],
-    arm_angle: float | None = None,
+    body: Body, positions: np.ndarray, transforms: np.ndarray, arm_angle: float | None = None
 ) -> Posture:
     """Return a body in a pose, given its vertices there [m] and the maps of its joints to it; see `Posture`."""
     transforms = np.asarray(transforms, np.float64)

@@ -72,9 +72,11 @@ def _add_mesh(builder: _Builder, mesh: animated.AnimatedMesh, timestep: float) -
                 setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
         skin = _add_skin(builder, mesh.name, mesh.skin, timestep)
     targets, weights = _add_targets(builder, base, offsets, faces, vertices)
+    # The smallest type that can't be taken for a primitive restart.
+    corners = split.reshape(-1).astype(np.uint16 if len(vertices) < np.iinfo(np.uint16).max else np.uint32)
     primitive = gltf.Primitive(
         attributes=attributes,
-        indices=builder.add_indices(split, len(vertices)),
+        indices=builder.add_accessor(corners, gltf.SCALAR, target=gltf.ELEMENT_ARRAY_BUFFER),
         material=builder.add_material(mesh.name, mesh.color),
         targets=targets,
     )
@@ -217,13 +219,6 @@ class _Builder:
     def add_vertices(self, values: np.ndarray, kind: str) -> int:
         """Add other values per vertex, such as normals."""
         return self.add_accessor(values, kind, target=gltf.ARRAY_BUFFER)
-
-    def add_indices(self, faces: np.ndarray, num_vertices: int) -> int:
-        """Add the triangles, in the smallest type that can't be taken for a primitive restart."""
-        dtype = np.uint16 if num_vertices < np.iinfo(np.uint16).max else np.uint32
-        return self.add_accessor(
-            faces.reshape(-1).astype(dtype), gltf.SCALAR, target=gltf.ELEMENT_ARRAY_BUFFER
-        )
 
     def add_material(self, name: str, color: Color) -> int:
         """Append a rough two-sided material and return its index."""

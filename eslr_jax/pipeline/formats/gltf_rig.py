@@ -60,7 +60,10 @@ def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     """
     document = GltfDocument(path)
     joints = read_joints(document)
-    carriers = {node: _carrier(document, joints, node) for node in range(len(document.parents))}
+    carriers: dict[int, int | None] = {-1: None}  # the joint that a node hangs on
+    for node in document.order:
+        is_joint = node in joints.nodes
+        carriers[node] = joints.nodes.index(node) if is_joint else carriers[document.parents[node]]
     found = {}  # nodes of the body, and the names they go by
     for index, node in enumerate(document.items("nodes")):
         if "mesh" in node and ("skin" in node or carriers[index] is not None):
@@ -189,13 +192,6 @@ def _bind_space(
         if abs(own - size) <= _SCALE_TOLERANCE * size and away < least:
             best, least = candidate, away
     return best
-
-
-def _carrier(document: GltfDocument, joints: _Joints, node: int) -> int | None:
-    """Return the joint that a node hangs on; None if there is none."""
-    while node >= 0 and node not in joints.nodes:
-        node = document.parents[node]
-    return joints.nodes.index(node) if node >= 0 else None
 
 
 def _read_node(

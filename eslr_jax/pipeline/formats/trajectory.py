@@ -123,16 +123,8 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
     if "body_positions" in arrays:
         values = {field: arrays[name] for field, name in _BODY.items()}
         body = AnimatedMesh("body", **values, color=SKIN_COLOR, skin=skin)
-    return TrajectoryFile(
-        arrays["positions"],
-        arrays["velocities"],
-        arrays["faces"],
-        float(arrays["timestep"]),
-        metadata,
-        body,
-        arrays.get("friction_loads"),
-        arrays.get("residuals"),
-    )
+    track = (arrays["positions"], arrays["velocities"], arrays["faces"], float(arrays["timestep"]))
+    return TrajectoryFile(*track, metadata, body, arrays.get("friction_loads"), arrays.get("residuals"))
 
 
 def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:

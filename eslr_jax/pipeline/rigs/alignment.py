@@ -26,9 +26,7 @@ _BEFORE = {
 Parts = Mapping[Part, list[int]]  # joints of each part of a rig
 
 
-def match_parts(
-    target: Skeleton, source: Skeleton, followed: list[int]
-) -> tuple[dict[Part, list[int]], dict[Part, list[int]]]:
+def match_parts(target: Skeleton, source: Skeleton, followed: list[int]) -> tuple[Parts, Parts]:
     """Return the joints of each part that both rigs have: those of the body, and those of the source.
 
     `followed` has the joint of the source that each joint of the body follows, or -1.
