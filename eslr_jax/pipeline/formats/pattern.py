@@ -224,11 +224,7 @@ def _read_seams(given: Sequence[Any], panels: Mapping[str, Panel], name: str) ->
     seams, sewn = [], {}
     for number, stitch in enumerate(given):
         where = f"{name}: stitch {number}"
-        if (
-            not isinstance(stitch, list)
-            or len(stitch) not in (2, 3)
-            or stitch[2:] not in ([], ["right_wrong"])
-        ):
+        if not isinstance(stitch, list) or len(stitch) < 2 or stitch[2:] not in ([], ["right_wrong"]):
             raise MeshError(f"{where} is not two edges; give a panel and an edge for each")
         sides = tuple(_read_side(side, panels, where) for side in stitch[:2])
         seam = Seam((sides[0], sides[1]), len(stitch) == 3)
