@@ -155,19 +155,16 @@ def split_seams(
     corners = faces.reshape(-1)
     values = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
     keys = np.concatenate([corners[:, None].astype(np.float64), values.astype(np.float64)], axis=1)
-    unique, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    owner = unique[:, 0].astype(np.int64)
-    order = np.lexsort([first, owner])  # of each vertex the coordinate that comes first in the file
-    is_first = np.ones(len(order), bool)
-    is_first[1:] = owner[order][1:] != owner[order][:-1]
-    place = np.empty(len(order), np.int64)
-    place[order[is_first]] = owner[order[is_first]]
-    extra = order[~is_first]
-    extra = extra[np.argsort(first[extra], kind="stable")]
-    place[extra] = num_vertices + np.arange(len(extra))
-    uvs = np.zeros((num_vertices + len(extra), 2), np.float32)
-    uvs[place] = unique[:, 1:]
-    return place[inverse.ravel()].reshape(-1, 3), np.concatenate([np.arange(num_vertices), owner[extra]]), uvs
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # as they come in the file
+    owner = corners[first[order]]
+    is_extra = np.ones(len(owner), bool)
+    is_extra[np.unique(owner, return_index=True)[1]] = False  # the first coordinate of each vertex
+    place = np.where(is_extra, num_vertices - 1 + np.cumsum(is_extra), owner)
+    uvs = np.zeros((num_vertices + np.sum(is_extra), 2), np.float32)
+    uvs[place] = values[first[order]]
+    split = place[np.argsort(order)[inverse.ravel()]].reshape(-1, 3)
+    return split, np.concatenate([np.arange(num_vertices), owner[is_extra]]), uvs
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
