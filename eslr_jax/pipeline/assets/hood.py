@@ -87,10 +87,11 @@ def _convert(tensors: Tensors) -> Network:
         (steps,) = counts
     hidden = sum(name.startswith("kernel") for name in trained["decoder"]) - 1
     widths = {"latent_size": size, "hidden_layers": hidden}
-    config = Hood(steps_per_stage=steps, **widths)
     if is_flat:
         flat = {"smoothing_steps": 0, "attention_blocks": 0, "update_body": True}
         config = Eslr(message_passing_steps=steps, **flat, **widths)
+    else:
+        config = Hood(steps_per_stage=steps, **widths)
     statistics = {
         name: _normalizer(tensors, f"_{theirs}_normalizer") for name, theirs in _NORMALIZERS.items()
     }
