@@ -14,16 +14,15 @@ from scipy.spatial import cKDTree
 from eslr_jax.errors import AssetError
 from eslr_jax.mesh.topology import vertex_areas, vertex_normals
 from eslr_jax.numerics import components, product
-from eslr_jax.pipeline.report.gap import map_frames, trajectory_states
+from eslr_jax.pipeline.report.gap import map_frames
 from eslr_jax.pipeline.report.metrics import face_stretches
 from eslr_jax.pipeline.report.run import Run, run_trajectory
-from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential
 from eslr_jax.solver.solve import Start, solve
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.terms.term import vertex_shares
-from eslr_jax.types import ClothState, Scene
+from eslr_jax.types import Scene, Trajectory
 
 # Energy lost to air and damping belongs to a frame, not to a shape.
 _TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction")
@@ -76,9 +75,7 @@ def run_field(run: Run, name: str) -> Field:
         values = np.stack([vertex_areas(areas * row, faces, count) for row in stretches])
         values /= np.maximum(vertex_areas(areas, faces, count), 1e-12)
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
-    trajectory = run_trajectory(run)
-    states, _ = trajectory_states(trajectory, run.scene)
-    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
+    values = np.asarray(_every_frame(name, run_trajectory(run), run.scene))
     values = np.concatenate([np.zeros_like(values[:1]), values])
     values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
     # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
@@ -89,12 +86,10 @@ def run_field(run: Run, name: str) -> Field:
 
 
 @partial(jax.jit, static_argnames="name")
-def _every_frame(
-    name: str, reached: Float[Array, "frames vertices 3"], states: ClothState, scene: Scene
-) -> Float[Array, "frames vertices"]:
+def _every_frame(name: str, trajectory: Trajectory, scene: Scene) -> Float[Array, "frames vertices"]:
     """State the problem of every frame and return a value of where the cloth went [J]."""
     measure = gap_shares if name == "gap" else partial(energy_shares, name.removesuffix("-energy"))
-    return map_frames(measure, reached, states, frame_inputs(scene), scene)
+    return map_frames(measure, trajectory, scene)
 
 
 def energy_shares(
