@@ -233,12 +233,12 @@ def local_motion(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
     return rotations.astype(np.float32), translations.astype(np.float32)
 
 
-def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """Return what to add to the rest vertices so that the joints move them to given positions [m].
+def corrections(mesh: AnimatedMesh, skin: Skin, tolerance: float) -> np.ndarray | None:
+    """Return what to add to a mesh's vertices at rest so that the joints of its skin move them to their places.
 
-    Returns:
-        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance [m].
+    That is offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance [m].
     """
+    rest, positions = (np.asarray(part, np.float32) for part in (mesh.rest_positions, mesh.positions))
     weights, indices = influences(skin)
     rows = np.repeat(np.arange(len(rest)), weights.shape[1])
     blend = scipy.sparse.csr_array((weights.ravel(), (rows, indices.ravel())), (len(rest), len(skin.parents)))

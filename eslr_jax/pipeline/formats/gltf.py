@@ -51,7 +51,7 @@ def _add_mesh(builder: _Builder, mesh: animated.AnimatedMesh, timestep: float) -
     base, offsets = positions[0], positions - positions[0]
     if mesh.skin is not None:
         base = np.asarray(mesh.rest_positions, np.float32)
-        needed = animated.corrections(mesh.skin, base, positions, TOLERANCE)
+        needed = animated.corrections(mesh, mesh.skin, TOLERANCE)
         offsets = np.zeros((len(positions), 0, 3)) if needed is None else needed
     split, vertices, uvs = animated.split_seams(faces, len(base), mesh.corner_uvs)
     attributes = gltf.Attributes(

@@ -61,12 +61,8 @@ def _add_mesh(stage: Any, path: str, mesh: animated.AnimatedMesh) -> None:
     """Add a mesh: bound to a skeleton where that moves it exactly, as points otherwise."""
     from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
 
-    positions, rest, skin = np.asarray(mesh.positions, np.float32), mesh.rest_positions, mesh.skin
-    if (
-        skin is not None
-        and rest is not None
-        and animated.corrections(skin, rest, positions, TOLERANCE) is not None
-    ):
+    skin = mesh.skin
+    if skin is not None and animated.corrections(mesh, skin, TOLERANCE) is not None:
         skin = None  # joints alone don't do
     if skin is not None:
         UsdSkel.Root.Define(stage, path)
@@ -98,10 +94,10 @@ def _add_mesh(stage: Any, path: str, mesh: animated.AnimatedMesh) -> None:
         prim.CreateExtentAttr().Set(vectors(np.stack([points.min(axis=0), points.max(axis=0)])), time)
 
     if skin is not None:
-        set_points(np.asarray(rest, np.float32), Usd.TimeCode.Default())
+        set_points(np.asarray(mesh.rest_positions, np.float32), Usd.TimeCode.Default())
         _bind(stage, path, prim, skin)
         return
-    for frame, points in enumerate(positions):
+    for frame, points in enumerate(np.asarray(mesh.positions, np.float32)):
         set_points(points, Usd.TimeCode(frame))
         if mesh.velocities is not None:
             prim.CreateVelocitiesAttr().Set(vectors(mesh.velocities[frame]), frame)
