@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.registry import find_reader
 
-# Of a mesh on the host, in the signatures of what fits and repairs it.
+# Of a mesh on the host, for signatures.
 Positions = Float[np.ndarray, "vertices 3"]  # [m]
 Faces = Int[np.ndarray, "faces 3"]
 _FOLDED = -1e-6  # share of a polygon's squared area below which a triangle looks the other way
