@@ -78,8 +78,7 @@ def check_moving(
 ) -> None:
     """Raise a MeshError, or `not_finite`, unless arrays are a mesh over time; see `check_layout`."""
     arrays = {"positions": positions, "faces": faces}
-    layout = {name: MESH_LAYOUT[name] for name in arrays}
-    check_layout(arrays, layout, what=what, remedy=remedy, error=MeshError)
+    check_layout(arrays, MESH_LAYOUT, what=what, remedy=remedy, error=MeshError)
     if 0 in positions.shape or not len(faces):
         raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
     is_finite = np.isfinite(positions).all((1, 2))
@@ -95,13 +94,8 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
         raise MeshError("no mesh to write; give at least one")
     for mesh in meshes:
         what, remedy = f"mesh {mesh.name}", "simulate it again"
-        arrays = {
-            key: np.asarray(value)
-            for key, value in vars(mesh).items()
-            if key in MESH_LAYOUT and value is not None
-        }
-        if mesh.skin is not None:
-            arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
+        values = vars(mesh) | ({} if mesh.skin is None else vars(mesh.skin))
+        arrays = {key: np.asarray(values[key]) for key in MESH_LAYOUT if values.get(key) is not None}
         check_layout(arrays, MESH_LAYOUT, what=what, remedy=remedy, error=MeshError)
         check_moving(arrays["positions"], arrays["faces"], what=what, remedy=remedy)
         if mesh.skin is None:
