@@ -124,11 +124,7 @@ def read_joints(document: GltfDocument) -> _Joints:
     if not skins:
         raise AssetError(f"{document.path} has no skin; give a character that is bound to a skeleton")
     world = document.world_matrices({}, 1)[0]
-    users = {
-        node.get("skin"): index
-        for index, node in reversed(list(enumerate(document.items("nodes"))))
-        if "skin" in node
-    }
+    skinned = [node.get("skin") for node in document.items("nodes")]
     frames: dict[int, np.ndarray] = {}
     spaces: dict[int, np.ndarray] = {}
     for number, skin in enumerate(skins):
@@ -147,7 +143,7 @@ def read_joints(document: GltfDocument) -> _Joints:
             bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
         if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
             raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
-        user = users.get(number)
+        user = skinned.index(number) if number in skinned else None
         spaces[number] = _bind_space(document, world, nodes, bind, user)
         rest = spaces[number] @ np.linalg.inv(bind)
         for node, frame in zip(nodes, rest, strict=True):

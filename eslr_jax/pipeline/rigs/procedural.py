@@ -25,8 +25,6 @@ _SWING_SECONDS = 1.0  # there and back
 _GRAVITY = 9.81  # [m/s^2]
 
 _Rotations = dict[Part, NDArray]  # [frames, 3], local axis-angle in left, up, front [rad]
-
-
 # A movement takes the time since it began [s], shape [frames], and the height of the hips above the floor [m]; it
 # returns rotations and root offsets [m].
 
