@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 DATA = Path(__file__).resolve().parent
@@ -196,38 +195,10 @@ def pose_vertices(body: dict[str, NDArray], rotations: NDArray) -> NDArray:
     )
 
 
-def edges_cross_triangles(edges: NDArray, triangles: NDArray) -> NDArray:
-    """Whether segment i crosses triangle i; [n, 2, 3] and [n, 3, 3] -> [n] (Moller and Trumbore 1997)."""
-    direction = edges[:, 1] - edges[:, 0]
-    side_u, side_v = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    cross = np.cross(direction, side_v)
-    determinant = np.einsum("ij,ij->i", side_u, cross)
-    safe = np.where(np.abs(determinant) < 1e-14, np.inf, determinant)
-    offset = edges[:, 0] - triangles[:, 0]
-    u = np.einsum("ij,ij->i", offset, cross) / safe
-    cross_offset = np.cross(offset, side_u)
-    v = np.einsum("ij,ij->i", direction, cross_offset) / safe
-    t = np.einsum("ij,ij->i", side_v, cross_offset) / safe
-    return np.isfinite(safe) & (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
-
-
-def self_intersecting_faces(positions: NDArray, faces: NDArray) -> NDArray:
-    """Indices of the faces that cross another face with which they share no vertex."""
-    corners = positions[faces].astype(np.float64)
-    centres = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
-    pairs = cKDTree(centres).query_pairs(2 * reach, output_type="ndarray")
-    shares = (faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None, :]).any(axis=(1, 2))
-    pairs = pairs[~shares]
-    crosses = np.zeros(len(pairs), bool)
-    for one, other in (pairs.T, pairs[:, ::-1].T):
-        for start, end in ((0, 1), (1, 2), (2, 0)):
-            crosses |= edges_cross_triangles(corners[one][:, [start, end]], corners[other])
-    return np.unique(pairs[crosses])
-
-
 def is_armpit_face(body: dict[str, NDArray]) -> NDArray:
     """Faces near the shoulders that intersect others when the arms hang, and their ring; shape [faces]."""
+    from eslr_jax.mesh.piercing import piercing_edges
+
     names = [str(name) for name in body["joint_names"]]
     shoulders = body["joint_rest_positions"][[names.index("LeftArm"), names.index("RightArm")]]
     centres = body["rest_positions"][body["faces"]].mean(axis=1)
@@ -236,8 +207,9 @@ def is_armpit_face(body: dict[str, NDArray]) -> NDArray:
     crossing = np.zeros(len(centres), bool)
     for lowering in ARM_LOWERING:
         for swing in ARM_SWINGS:
-            posed = pose_vertices(body, arm_rotations(names, lowering, swing))
-            crossing[near[self_intersecting_faces(posed, body["faces"][near])]] = True
+            posed = pose_vertices(body, arm_rotations(names, lowering, swing)).astype(np.float64)
+            owners, _, pierced = piercing_edges(posed, body["faces"][near])
+            crossing[near[np.concatenate([owners, pierced])]] = True
     is_touched = np.zeros(len(body["rest_positions"]), bool)
     is_touched[body["faces"][crossing]] = True
     return is_touched[body["faces"]].any(axis=1) if crossing.any() else crossing

@@ -1,22 +1,13 @@
 """Bundled bodies, garments, motions and networks, loaded by name, and those of a user by path."""
 
-from eslr_jax.pipeline.assets.catalog import (
-    Asset,
-    asset_names,
-    data_folder,
-    list_assets,
-    load_splits,
-    split_clips,
-)
+from eslr_jax.pipeline.assets.catalog import asset_names, data_folder, load_splits, split_clips
 from eslr_jax.pipeline.assets.garments import load_garment, load_garment_file, prepare_stored
 from eslr_jax.pipeline.assets.models import load_model
 from eslr_jax.pipeline.assets.motions import load_body, load_motion
 
 __all__ = [
-    "Asset",
     "asset_names",
     "data_folder",
-    "list_assets",
     "load_body",
     "load_garment",
     "load_garment_file",

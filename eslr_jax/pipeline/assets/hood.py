@@ -57,7 +57,6 @@ def read_hood(path: str | Path) -> Network:
 
 
 def _convert(tensors: Tensors) -> Network:
-    """Return the network."""
     is_flat = f"{_CORE}processor_steps.0.node_processor.0.layers.0.weight" in tensors
     trained = {
         "type_embedding": _tensor(tensors, "nodetype_embedding.weight"),
@@ -86,15 +85,13 @@ def _convert(tensors: Tensors) -> Network:
         if len(counts) > 1:
             raise ValueError(f"its stages have {sorted(counts)} steps, and ours all have as many")
         (steps,) = counts
-    widths = {
-        "latent_size": size,
-        "hidden_layers": sum(name.startswith("kernel") for name in trained["decoder"]) - 1,
-    }
-    config = (
-        Eslr(message_passing_steps=steps, smoothing_steps=0, attention_blocks=0, update_body=True, **widths)
-        if is_flat
-        else Hood(steps_per_stage=steps, **widths)
-    )
+    hidden = sum(name.startswith("kernel") for name in trained["decoder"]) - 1
+    widths = {"latent_size": size, "hidden_layers": hidden}
+    if is_flat:
+        flat = {"smoothing_steps": 0, "attention_blocks": 0, "update_body": True}
+        config = Eslr(message_passing_steps=steps, **flat, **widths)
+    else:
+        config = Hood(steps_per_stage=steps, **widths)
     statistics = {
         name: _normalizer(tensors, f"_{theirs}_normalizer") for name, theirs in _NORMALIZERS.items()
     }

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.skinning import smooth, transfer_skin_weights
-from eslr_jax.pipeline.dressing.postures import Posture, rest_posture, unpose
+from eslr_jax.pipeline.dressing.postures import Posture, blend, rest_posture
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.types import Body
 
 CLEARANCE = 3e-3  # [m] left between cloth and skin: a millimetre over the thickness of collisions
@@ -46,14 +47,11 @@ def body_heights(
 
 
 def push_out(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], posture: Posture
-) -> tuple[Float[np.ndarray, "vertices 3"], dict[str, dict[str, float]]]:
-    """Move vertices that lie inside a posed body or closer than 3 mm out along the skin's normal.
+    positions: Positions, faces: Faces, posture: Posture
+) -> tuple[Positions, dict[str, dict[str, float]]]:
+    """Return vertices, those in a posed body or closer than 3 mm moved out along its normals, and a report.
 
     Their neighbours follow, so that no dents stay. Vertices deeper than 6 cm stay, and are counted apart.
-
-    Returns:
-        New positions [m], and a report of the penetration before and after and of the distances moved.
     """
     result = positions.copy()
     heights, normals = body_heights(result, posture)
@@ -89,21 +87,11 @@ def _millimetres(lengths: np.ndarray) -> float:
 
 
 def lay_to_rest(
-    placed: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    posture: Posture,
-    body: Body,
-    *,
-    is_pushed: bool = True,
-) -> tuple[
-    Float[np.ndarray, "vertices 3"],
-    Float[np.ndarray, "vertices 4"],
-    Int[np.ndarray, "vertices 4"],
-    dict[str, Any],
-]:
+    placed: Positions, faces: Faces, posture: Posture, body: Body, *, is_pushed: bool = True
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return a garment in the body's rest pose, given it on the body in another pose [m].
 
-    That is rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`,
+    That is the positions and skin weights of a `GarmentFile`, and what was inside the posed body; see `push_out`,
     which is done in both poses unless `is_pushed` is false.
     """
     clear, penetration = push_out(placed, faces, posture) if is_pushed else (placed, {})
@@ -119,6 +107,8 @@ def lay_to_rest(
     )
     rest = clear
     if not np.array_equal(posture.transforms, np.broadcast_to(np.eye(3, 4), posture.transforms.shape)):
-        rest = unpose(clear, weights, indices, posture.transforms)
+        # What blended maps take to the posed positions.
+        blended = blend(weights, indices, posture.transforms)
+        rest = np.linalg.solve(blended[:, :, :3], (clear - blended[:, :, 3])[:, :, None])[:, :, 0]
         rest = push_out(rest, faces, rest_posture(body))[0] if is_pushed else rest
-    return rest, weights, indices, penetration
+    return {"rest_positions": rest, "skin_weights": weights, "skin_indices": indices}, penetration

@@ -11,21 +11,13 @@ import numpy as np
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.topology import face_areas, undirected_edges, vertex_components
 from eslr_jax.mesh.validate import check_arrays, validate_mesh
+from eslr_jax.pipeline.dressing import repair
 from eslr_jax.pipeline.dressing.clearance import lay_to_rest
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.pins import choose_pins
 from eslr_jax.pipeline.dressing.placement import find_placement
 from eslr_jax.pipeline.dressing.postures import arm_postures, rest_posture
 from eslr_jax.pipeline.dressing.remesh import remesh
-from eslr_jax.pipeline.dressing.repair import (
-    Cleaned,
-    consistent_orientation,
-    join_components,
-    largest_component,
-    shares_along_seams,
-    shell_thickness,
-    weld,
-)
 from eslr_jax.pipeline.dressing.report import describe_cost, wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape
 from eslr_jax.pipeline.formats.garment import GarmentFile, first_rows
@@ -80,24 +72,23 @@ def fit_garment(
     if text and options.edge_length is None:  # else it is remeshed, and its size is chosen
         warnings.warn(text, stacklevel=2)
     worn_by = body if made_for is None else made_for
-    clean, report = _clean(mesh.positions, mesh.faces, options)
+    clean, report = _clean(mesh, options)
     postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
     facing = chest_direction(worn_by)
     placement = find_placement(
         clean.positions, clean.faces, postures, options, is_metric=mesh.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
-    clean, joined, doubts = _join(
-        dataclasses.replace(clean, positions=placement.apply(clean.positions)), options
-    )
-    thickness = shell_thickness(clean.positions, clean.faces)
+    clean = dataclasses.replace(clean, positions=placement.apply(clean.positions))
+    clean, joined, doubts = _join(clean, options)
+    thickness = repair.shell_thickness(clean.positions, clean.faces)
     if thickness is not None:
         doubts.append(
             f"it is a closed shell with two sides {1e3 * thickness:.1f} mm apart, which is stiff as foam; "
             "export a single layer (thin, without thickness)"
         )
     # Faces are turned that disagree with neighbours, and parts that face the body.
-    turn = consistent_orientation(clean.positions, clean.faces)
+    turn = repair.consistent_orientation(clean.positions, clean.faces)
     is_turned = turn ^ posture.is_turned_in(clean.positions, _turn(clean.faces, turn))
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
@@ -127,31 +118,22 @@ def fit_garment(
             sewn, faces, posture, made_for, body, scale=options.scale
         )
         transfer = {"transfer": carried}
-    rest, weights, indices, penetration = lay_to_rest(
-        placed, faces, worn_in, body, is_pushed=options.push_out
-    )
-    is_pinned, pinned_by, falling = choose_pins(
-        options.pin,
-        file_pins,
-        body,
-        positions=rest,
+    worn, penetration = lay_to_rest(placed, faces, worn_in, body, is_pushed=options.push_out)
+    garment = GarmentFile(
+        **worn,
         faces=faces,
-        vertex_map=vertex_map,
-        face_parts=parts,
-        part_names=mesh.part_names,
-    )
-    return GarmentFile(
-        rest_positions=rest,
-        faces=faces,
-        skin_weights=weights,
-        skin_indices=indices,
-        is_pinned=is_pinned,
+        is_pinned=file_pins,
         sewn_positions=sewn,
         corner_uvs=uvs,
         face_parts=parts,
         part_names=mesh.part_names,
         vertex_map=vertex_map,
         joined_rows=joined_rows,
+    )
+    is_pinned, pinned_by, falling = choose_pins(options.pin, garment, body)
+    return dataclasses.replace(
+        garment,
+        is_pinned=is_pinned,
         metadata={
             "name": name,
             **wearer_entry(body),
@@ -178,31 +160,30 @@ def fit_garment(
     )
 
 
-def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
-    """Weld open edges; return the mesh and a report."""
-    clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
+def _clean(mesh: MeshFile, options: FitOptions) -> tuple[repair.Cleaned, dict[str, Any]]:
+    clean = repair.weld(mesh.positions, mesh.faces.astype(np.int64), tolerance=options.weld)
     if not face_areas(clean.positions, clean.faces).sum() > 0:
         raise MeshError(
             "no face with an area is left after welding coincident vertices; check the mesh, or give eslr fit a "
             "smaller --weld"
         )
-    num_used = len(np.unique(faces))
+    num_used = len(np.unique(mesh.faces))
     return clean, {
-        "source_vertices": len(positions),
-        "source_faces": len(faces),
-        "loose_vertices": len(positions) - num_used,
+        "source_vertices": len(mesh.positions),
+        "source_faces": len(mesh.faces),
+        "loose_vertices": len(mesh.positions) - num_used,
         "welded_vertices": num_used - len(clean.positions),
-        "dropped_faces": len(faces) - len(clean.faces),
+        "dropped_faces": len(mesh.faces) - len(clean.faces),
         "components": vertex_components(clean.faces, len(clean.positions))[0],
     }
 
 
-def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any], list[str]]:
+def _join(clean: repair.Cleaned, options: FitOptions) -> tuple[repair.Cleaned, dict[str, Any], list[str]]:
     """Join or drop separate parts as the options say; positions are in metres. Return report and warnings."""
     chosen, doubts = options.components, []
     if chosen == "auto":
         gaps = (min(_SEAM, options.join_gap), options.join_gap)
-        shares = shares_along_seams(clean.positions, clean.faces, gaps)
+        shares = repair.shares_along_seams(clean.positions, clean.faces, gaps)
         is_open, is_near = (share > _ALONG for share in shares)
         chosen = "join" if is_open else "keep"
         if is_near:
@@ -214,9 +195,9 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any],
     if chosen not in ("join", "largest"):
         return clean, {}, doubts
     if chosen == "join":
-        step = join_components(clean.positions, clean.faces, options.join_gap)
+        step = repair.join_components(clean.positions, clean.faces, options.join_gap)
     else:
-        step = largest_component(clean.positions, clean.faces)
+        step = repair.largest_component(clean.positions, clean.faces)
     if options.components == "auto" and undirected_edges(step.faces)[2].max() > 2:
         return clean, {}, doubts  # an edge of three pieces, such as a pocket's on a seam
     onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1

@@ -15,6 +15,7 @@ from eslr_jax.mesh.skinning import smooth
 from eslr_jax.mesh.topology import inverse_rest_frames, is_on_boundary, vertex_normals
 from eslr_jax.pipeline.dressing.report import common_wearer
 from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Faces, Positions, join_meshes, stack_tables
 
 LAYER_GAP = 5e-3  # [m] left between two layers at rest: more than the thickness of the body's contact
 _REACH = 0.05  # [m] beneath a layer from which cloth is moved over it; deeper, it belongs to another limb
@@ -67,8 +68,7 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
                 )
         placed.append(positions)
     counts = [len(positions) for positions in placed]
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    influences = max(garment.skin_weights.shape[1] for garment in garments)
+    positions, faces = join_meshes(placed, [garment.faces for garment in garments])
     sewn = [g.rest_positions if g.sewn_positions is None else g.sewn_positions for g in garments]
     uvs = [np.zeros((len(g.faces), 3, 2)) if g.corner_uvs is None else g.corner_uvs for g in garments]
     has_uvs = any(garment.corner_uvs is not None for garment in garments)
@@ -90,30 +90,21 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
             given |= {f"{name}/{part}": fabric} if separator else dict.fromkeys(given, fabric)
         fabrics += [f"{part}:{fabric}" for part, fabric in given.items()]
     return GarmentFile(
-        rest_positions=np.concatenate(placed),
-        faces=np.concatenate([g.faces + start for g, start in zip(garments, starts, strict=True)]),
-        skin_weights=_stack([garment.skin_weights for garment in garments], influences),
-        skin_indices=_stack([garment.skin_indices for garment in garments], influences),
+        rest_positions=positions,
+        faces=faces,
+        skin_weights=stack_tables([garment.skin_weights for garment in garments]),
+        skin_indices=stack_tables([garment.skin_indices for garment in garments]),
         is_pinned=np.concatenate([garment.is_pinned for garment in garments]),
         sewn_positions=np.concatenate(sewn),
         panel_corners=np.concatenate(corners) if is_cut else None,
         corner_uvs=np.concatenate(uvs) if has_uvs else None,
         face_parts=np.concatenate(face_parts),
         part_names=tuple(part_names),
-        metadata={
-            "outfit": dict(zip(names, counts, strict=True)),
-            "fabrics": fabrics,
-            **wearer,
-        },
+        metadata={"outfit": dict(zip(names, counts, strict=True)), "fabrics": fabrics, **wearer},
     )
 
 
-def _move_over(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    inner: Float[np.ndarray, "inner_vertices 3"],
-    inner_faces: Int[np.ndarray, "inner_faces 3"],
-) -> Float[np.ndarray, "vertices 3"]:
+def _move_over(positions: Positions, faces: Faces, inner: np.ndarray, inner_faces: np.ndarray) -> Positions:
     """Return a layer with its vertices moved out over another one, and its faces off that one's vertices."""
     result = positions.copy()
     for _ in range(_ROUNDS):
@@ -135,9 +126,7 @@ def _move_over(
 
 
 def _heights(
-    points: Float[np.ndarray, "points 3"],
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    points: Float[np.ndarray, "points 3"], positions: Positions, faces: Faces
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"], Int[np.ndarray, " points"]]:
     """Return how high points are over a layer [m], infinite where they are beside it, its normals and faces.
 
@@ -151,14 +140,7 @@ def _heights(
     return np.where(is_beside, np.inf, heights), place.normals, place.faces
 
 
-def _flat(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "faces 3 2"]:
+def _flat(positions: Positions, faces: Faces) -> Float[np.ndarray, "faces 3 2"]:
     """Return the corners of every face in its own plane [m]."""
     edges = np.linalg.inv(inverse_rest_frames(positions, faces)).swapaxes(1, 2)
     return np.concatenate([edges, np.zeros((len(faces), 1, 2))], axis=1)
-
-
-def _stack(tables: list[np.ndarray], width: int) -> np.ndarray:
-    """Return tables below each other, with columns of zeros up to a width."""
-    return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])

@@ -13,6 +13,7 @@ from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.topology import undirected_edges
 from eslr_jax.pipeline.dressing.repair import consistent_orientation
 from eslr_jax.pipeline.extras import require
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pipeline.formats.pattern import Pattern, Side, edge_length, signed_area
 
 _SIZES = (100, 100_000)  # vertices that may be asked for
@@ -26,22 +27,17 @@ _SMOOTHED = 4  # of these, in which vertices move to the middle of their neighbo
 class SewnMesh:
     """The panels of a pattern, joined along their seams."""
 
-    faces: Int[np.ndarray, "faces 3"]  # all turned the same way, outwards or inwards
+    faces: Faces  # all turned the same way, outwards or inwards
     panel_corners: Float[np.ndarray, "faces 3 2"]  # corners of each face in the plane of its panel [m]
-    placed: Float[np.ndarray, "vertices 3"]  # in the middle of the places that the panels give a vertex [m]
-    spans: Float[np.ndarray, "vertices 3"]  # from one side of its seam to the other, as placed [m]
+    placed: Positions  # in the middle of the places that the panels give a vertex [m]
+    spans: Positions  # from one side of its seam to the other, as placed [m]
     face_panels: Int[np.ndarray, " faces"]  # in the order of the pattern
     seam_edges: Int[np.ndarray, "edges 2"]  # mesh edges along seams
     edge_seams: Int[np.ndarray, " edges"]  # the seam of each
 
 
 def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> SewnMesh:
-    """Cut the panels of a pattern into triangles and join them.
-
-    Args:
-        pattern: Panels and seams.
-        num_vertices: About how many vertices the mesh is to have.
-        name: Name of the pattern in messages.
+    """Cut the panels of a pattern into triangles, with about so many vertices, and join them.
 
     Raises:
         ConfigError: The number is out of range.
@@ -53,11 +49,11 @@ def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> S
     area = sum(abs(signed_area(panel.outline)) for panel in pattern.panels.values())
     spacing = float(np.sqrt(2.0 * area / (np.sqrt(3.0) * num_vertices)))  # of equilateral triangles
     sewn = {side for seam in pattern.seams for side in seam.sides}
-    pieces = {
-        Side(key, number): _num_pieces(edge_length(edge) / spacing, 1 if Side(key, number) in sewn else 2)
-        for key, panel in pattern.panels.items()
-        for number, edge in enumerate(panel.edges)
-    }
+    pieces = {}  # of every edge
+    for key, panel in pattern.panels.items():
+        for number, edge in enumerate(panel.edges):
+            side, length = Side(key, number), edge_length(edge) / spacing
+            pieces[side] = 0 if length < _SHORT else max(round(length), 1 if side in sewn else 2)
     for seam in pattern.seams:
         pieces |= dict.fromkeys(seam.sides, max(pieces[side] for side in seam.sides))
     flat, placed, faces, owners, rows, count = [], [], [], [], {}, 0
@@ -86,11 +82,11 @@ def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> S
         owners.append(np.full(len(triangles), number))
         count += len(points)
     flat, placed, faces = np.concatenate(flat), np.concatenate(placed), np.concatenate(faces)
-    sides = [[rows[side] for side in seam.sides] for seam in pattern.seams]
-    pairs = [
-        (a, b if seam.is_parallel else b[::-1]) for (a, b), seam in zip(sides, pattern.seams, strict=True)
-    ]
-    first, second = (np.concatenate(rows) for rows in zip(*pairs, strict=True))
+    pairs = []
+    for seam in pattern.seams:
+        one, other = (rows[side] for side in seam.sides)
+        pairs.append((one, other if seam.is_parallel else other[::-1]))
+    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
     graph = scipy.sparse.coo_array((np.ones(len(first), bool), (first, second)), (count, count))
     num_joined, vertex = connected_components(graph, directed=False)
     totals = np.zeros((num_joined, 3))
@@ -113,9 +109,7 @@ def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> S
 
 
 def _gathered(
-    flat: Float[np.ndarray, "rows 2"],
-    faces: Int[np.ndarray, "faces 3"],
-    pairs: list[tuple[np.ndarray, np.ndarray]],
+    flat: Float[np.ndarray, "rows 2"], faces: Faces, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> Float[np.ndarray, "faces 3 2"]:
     """Return the corners of faces [m], those along the longer side of a seam as short there as the other side.
 
@@ -140,11 +134,6 @@ def _gathered(
     return corners
 
 
-def _num_pieces(length: float, least: int) -> int:
-    """Return in how many pieces an edge is divided, given its length over that of a piece."""
-    return 0 if length < _SHORT else max(round(length), least)
-
-
 def _divided(line: Float[np.ndarray, "points 2"], pieces: int) -> Float[np.ndarray, "_ 2"]:
     """Return a line in pieces of equal length, with both ends; with no piece, its start."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
@@ -154,7 +143,7 @@ def _divided(line: Float[np.ndarray, "points 2"], pieces: int) -> Float[np.ndarr
 
 def _triangulate(
     outline: Float[np.ndarray, "outline 2"], is_sewn: Bool[np.ndarray, " outline"], spacing: float
-) -> tuple[Float[np.ndarray, "vertices 2"], Int[np.ndarray, "faces 3"]]:
+) -> tuple[Float[np.ndarray, "vertices 2"], Faces]:
     """Return vertices of a panel, the outline's first, and its triangles.
 
     No edge inside joins two sewn vertices: two panels would have it in common besides the seam.
@@ -184,7 +173,7 @@ def _triangulate(
     return points, faces
 
 
-def _delaunay(points: Float[np.ndarray, "points 2"], num_outline: int) -> Int[np.ndarray, "faces 3"]:
+def _delaunay(points: Float[np.ndarray, "points 2"], num_outline: int) -> Faces:
     """Return triangles between points, which the closed line of the first ones bounds."""
     cdt = require("pythoncdt", extra="patterns", purpose="a sewing pattern")
     mesh = cdt.Triangulation(cdt.VertexInsertionOrder.AUTO, cdt.IntersectingConstraintEdges.NOT_ALLOWED, 0.0)

@@ -9,12 +9,14 @@ import dataclasses
 import re
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from scipy.spatial import KDTree
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.mesh.topology import boundary_loops, vertex_components
 from eslr_jax.pipeline.dressing.postures import body_middle, shoulder_height
+from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.types import Body
 
 WAISTBAND = 0.03  # [m] width of the band below the loop that is held, as an elastic waistband
@@ -46,24 +48,18 @@ class Waist:
 
 
 def choose_pins(
-    texts: tuple[str, ...],
-    file_pins: Bool[np.ndarray, " vertices"],
-    body: Body,
-    *,
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    **names,
+    texts: tuple[str, ...], garment: GarmentFile, body: Body
 ) -> tuple[Bool[np.ndarray, " vertices"], str, list[str]]:
-    """Return the pinned vertices, where the pins come from, and a warning if nothing holds the garment.
+    """Return the vertices to pin, where the pins come from, and a warning if nothing holds the garment.
 
-    Pins are written as `PIN_FORMS` has them; without any, those of the file hold, or else what holds the
-    garment up in the body's rest pose. `names` is what pins may name; see `select_vertices`.
+    Pins are written as `PIN_FORMS` has them; without any, those that the garment has hold, of its file, or else
+    what holds it up in the body's rest pose.
 
     Raises:
         ConfigError: A pin is unknown, or it contradicts another.
     """
-    waist = find_waist(positions, faces, body)
-    is_pinned = file_pins.copy()
+    waist = find_waist(garment.rest_positions, garment.faces, body)
+    file_pins, is_pinned = garment.is_pinned, garment.is_pinned.copy()
     if "none" in texts:
         if len(texts) > 1:
             raise ConfigError("pin 'none' holds nothing; leave out the other pins")
@@ -72,9 +68,7 @@ def choose_pins(
         if "waist" in texts and not waist.is_held.any():
             raise ConfigError(f"pin 'waist' holds no vertex: {waist.reason}")
         for text in texts:
-            is_pinned |= (
-                waist.is_held if text == "waist" else select_vertices(text, positions, faces, **names)
-            )
+            is_pinned |= waist.is_held if text == "waist" else select_vertices(text, garment)
         pinned_by = f"--pin {' '.join(texts)}{' and the file' if file_pins.any() else ''}"
     elif file_pins.any():
         pinned_by = "the file"
@@ -85,41 +79,35 @@ def choose_pins(
     return is_pinned, pinned_by, [f"nothing holds the garment up: {waist.reason}; {remedy}"] if falls else []
 
 
-def select_vertices(
-    text: str,
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    *,
-    vertex_map: Int[np.ndarray, " source_vertices"],
-    face_parts: Int[np.ndarray, " faces"] | None,
-    part_names: tuple[str, ...],
-) -> Bool[np.ndarray, " vertices"]:
+def select_vertices(text: str, garment: GarmentFile) -> Bool[np.ndarray, " vertices"]:
     """Return a mask of the vertices that a pin names, one of `PIN_FORMS` but none and waist.
 
-    Vertices are counted from zero, as in the file; `vertex_map` has what became of each, -1 where it was
-    dropped. Regions are in the body's frame [m]: left is +x, up is +y, front is +z. Open edges are numbered by
-    their number of vertices, most first, or named by the side on which their middle lies.
+    Vertices are counted from zero, as in the garment's source. Regions are in the body's frame [m]: left is +x,
+    up is +y, front is +z. Open edges are numbered by their number of vertices, most first, or named by the side
+    on which their middle lies.
 
     Raises:
         ConfigError: The form is unknown, or nothing has that name or number.
     """
     kind, _, rest = text.partition(":")
+    positions, faces, part_names = garment.rest_positions, garment.faces, garment.part_names
     chosen = np.zeros(len(positions), bool)
     if kind == "vertices":
         try:
             numbers = np.array([int(word) for word in rest.split(",")])
         except ValueError as error:
             raise ConfigError(f"pin {text!r}: write whole numbers with commas between") from error
+        vertex_map = np.arange(len(positions)) if garment.vertex_map is None else garment.vertex_map
         if numbers.min() < 0 or numbers.max() >= len(vertex_map):
             raise ConfigError(f"pin {text!r}: the file has vertices 0 to {len(vertex_map) - 1}")
         found = vertex_map[numbers]
         chosen[found[found >= 0]] = True
     elif kind == "part":
-        if face_parts is None or rest not in part_names:
+        if garment.face_parts is None or rest not in part_names:
             raise ConfigError(
                 f"pin {text!r}: there is no such part; parts: {', '.join(part_names) or 'none'}"
             )
-        chosen[faces[face_parts == part_names.index(rest)]] = True
+        chosen[faces[garment.face_parts == part_names.index(rest)]] = True
     elif kind == "region":
         chosen[:] = True
         for part in rest.split(","):
@@ -152,9 +140,7 @@ def _loop(text: str, rest: str, positions: np.ndarray, loops: list[np.ndarray]) 
     return loops[int(rest)]
 
 
-def find_waist(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], body: Body
-) -> Waist:
+def find_waist(positions: Positions, faces: Faces, body: Body) -> Waist:
     """Find what holds up the parts of a garment in the body's rest pose.
 
     A part that reaches above the shoulder joints hangs from them, unless it leaves more than 150 degrees around

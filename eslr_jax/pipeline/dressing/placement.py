@@ -1,4 +1,4 @@
-"""Recognise a garment's unit, axes, place and posture by how well it wraps the body."""
+"""Recognise a garment's unit, axes, place and posture by how well it wraps the body, and is worn on it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,15 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from eslr_jax.errors import MeshError
+from eslr_jax.mesh.topology import boundary_loops, face_areas, vertex_areas
 from eslr_jax.mesh.validate import UNITS
+from eslr_jax.numerics import pierces
 from eslr_jax.pipeline.dressing.options import Axis, FitOptions, Unit
 from eslr_jax.pipeline.dressing.postures import Posture
-from eslr_jax.pipeline.dressing.scoring import (
-    DEEP,
-    Sample,
-    count_pierced,
-    fit_cost,
-    sample_garment,
-    wearing_cost,
-)
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 
 # Feet and decimetres have to be given: no garment's file was seen in them.
 _TRIED_UNITS = ("m", "cm", "mm", "in")
@@ -43,6 +38,19 @@ _SCALES = np.arange(0.88, 1.121, 0.01)  # of the unit, tried to see whether it i
 _SCALE_TOLERANCE = 0.02  # deviation of the best scale from which it is told
 _LARGER, _SMALLER = 0.15, 0.35  # share of the cost that it must save; a roomy garment fits better if smaller
 _MOVED = 0.3  # cost that a place which was looked for may save against the origin at another scale
+_POINTS = 160  # garment points whose distances are measured
+_TOP_POINTS = 16  # the highest of them, by which a garment hangs
+_INSIDE, _MAX_INSIDE = 0.01, 0.06  # [m] of depth that costs one, and beyond which the cost stays
+_OUTSIDE, _MAX_OUTSIDE = 0.05, 0.10  # [m] likewise outside, where cloth may hang loose
+_SUPPORT = 0.4  # weight of the distance at the top
+_BELOW_FLOOR = 4.0  # cost of a garment under the floor
+_PIERCED = 0.4  # cost of a limb that pierces the cloth
+_ARMHOLE = 0.35  # of a limb, that may pierce it
+_EMPTY = 0.6  # cost of a garment through none of whose openings a bone passes
+# Cost of a garment that slips; [m] it is let down; inside cost that holds.
+_SLIPS, _DROP, _HELD = 0.4, 0.04, 0.07
+_COARSE_FACES = 4000  # beyond which bones are tested against a coarser mesh
+DEEP = 0.01  # [m] of depth from which a point is called deep inside
 _VECTORS = {
     f"{sign}{axis}": np.array([float(axis == other) * (-1 if sign else 1) for other in "xyz"])
     for sign, axis in itertools.product(("", "-"), "xyz")
@@ -84,8 +92,8 @@ class Placement:
 
 
 def find_placement(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    positions: Positions,
+    faces: Faces,
     postures: list[Posture],
     options: FitOptions | None = None,
     *,
@@ -95,7 +103,7 @@ def find_placement(
 ) -> Placement:
     """Return the unit, axes, place and posture in which a garment fits the body best.
 
-    Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
+    Every combination of what was not given is tried on a sample of points; see `fit_cost`. What is usual
     costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
     compares the best placement with the next best one that differs from it, and is less by the share of points
     deep inside the body. Postures are those that the garment may have been modelled on, the rest pose first.
@@ -151,8 +159,7 @@ def find_placement(
             f"the place is doubtful (confidence {confidence:.0%}): {' and '.join(doubts)}; look at the picture, "
             "and give eslr fit --units, --up, --front or --keep-place, or the body that it was made for"
         )
-    pierced = count_pierced(sample, best.bones(postures[best.posture]), postures[best.posture].is_limb)
-    if pierced:
+    if pierced := count_pierced(sample, best, postures[best.posture]):
         warnings.append(
             f"{pierced} limbs of the body pierce the cloth: it was made for another body or pose; give eslr fit "
             "--made-for that body (for SMPL's garments a SMPL model)"
@@ -185,8 +192,7 @@ def _choose(
     for candidate in sorted(candidates, key=lambda placement: placement.cost):
         if rival is not None and candidate.cost > rival.cost:
             break
-        posture = postures[candidate.posture]
-        extra = wearing_cost(sample, candidate.apply(sample.points), candidate.bones(posture), posture)
+        extra = wearing_cost(sample, candidate, postures[candidate.posture])
         done.append(dataclasses.replace(candidate, cost=candidate.cost + extra))
         best = min(done, key=lambda placement: placement.cost)
         rivals = [other for other in done if _is_rival(best, other, sample)]
@@ -212,9 +218,7 @@ def _is_poor(best: Placement, sample: Sample, postures: list[Posture]) -> bool:
     posture = postures[best.posture]
     heights = posture.heights(best.apply(sample.points))
     is_off = np.mean(heights < -DEEP) > _LIMBS_INSIDE or np.mean(np.abs(heights) < _NEAR) < _MIN_NEAR
-    return (
-        best.cost > _POOR or bool(is_off) or count_pierced(sample, best.bones(posture), posture.is_limb) > 0
-    )
+    return best.cost > _POOR or bool(is_off) or count_pierced(sample, best, posture) > 0
 
 
 def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture]) -> list[Placement]:
@@ -316,3 +320,82 @@ def _rotations(
     if not result:
         raise MeshError(f"up {up} and front {front} are the same axis; give two different ones")
     return result
+
+
+# ---------------------------------------------------------------- how badly a placed garment fits
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """Points of a garment in the file's coordinates, spread evenly over its area, and coarse triangles."""
+
+    points: Float[np.ndarray, "points 3"]
+    cloth: Float[np.ndarray, "triangles 3 3"]
+    openings: Float[np.ndarray, "fans 3 3"]  # that close the boundary loops; none for a sheet's one outline
+
+
+def sample_garment(positions: Positions, faces: Faces) -> Sample:
+    """Return a sample of a garment; equal garments give equal samples."""
+    areas = vertex_areas(face_areas(positions, faces), faces, len(positions))
+    picked = np.searchsorted(np.cumsum(areas) / areas.sum(), (np.arange(_POINTS) + 0.5) / _POINTS)
+    extremes = np.concatenate([positions.argmin(axis=0), positions.argmax(axis=0)])
+    points = np.unique(np.concatenate([np.minimum(picked, len(positions) - 1), extremes]))
+    fans = [np.empty((0, 3, 3))]
+    loops = boundary_loops(faces)
+    for loop in map(positions.__getitem__, loops if len(loops) > 1 else []):
+        center = np.broadcast_to(loop.mean(axis=0), loop.shape)
+        fans.append(np.stack([loop, np.roll(loop, -1, axis=0), center], axis=1))
+    sampled = positions[points]
+    if len(faces) > _COARSE_FACES:  # vertices are merged by cells of a grid
+        size = 1.5 * np.sqrt(face_areas(positions, faces).sum() / _COARSE_FACES)
+        cells = np.floor((positions - positions.min(axis=0)) / size).astype(np.int64)
+        _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        cell = cell.ravel()
+        sums = [np.bincount(cell, positions[:, axis]) for axis in range(3)]
+        positions, faces = np.stack(sums, axis=1) / counts[:, None], cell[faces]
+        faces = faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)]
+    return Sample(sampled, positions[faces], np.concatenate(fans))
+
+
+def fit_cost(points: Float[np.ndarray, "points 3"], posture: Posture) -> float:
+    """Return the cost of placed points [m]; 0 is skin-tight, 1 is 5 cm outside or 1 cm inside on average.
+
+    A garment hangs by its highest points, so these should be near the body. No garment is under the floor.
+    """
+    heights = posture.heights(points)
+    misfit = np.mean(_inside(heights) + np.clip(heights, 0.0, _MAX_OUTSIDE) / _OUTSIDE)
+    top = np.argsort(-points[:, 1], kind="stable")[:_TOP_POINTS]
+    support = np.mean(np.minimum(np.abs(heights[top]), _MAX_OUTSIDE)) / _OUTSIDE
+    below = np.mean(points[:, 1] < posture.floor - _OUTSIDE)
+    return float(misfit + _SUPPORT * support + _BELOW_FLOOR * below)
+
+
+def count_pierced(sample: Sample, placement: Placement, posture: Posture) -> int:
+    """Return how many limbs pierce the placed cloth, without their starts, which lie at armholes."""
+    limbs = placement.bones(posture)[posture.is_limb]
+    return int(np.sum(_crosses(limbs + _ARMHOLE * (limbs[:, ::-1] - limbs) * [[1], [0]], sample.cloth)))
+
+
+def wearing_cost(sample: Sample, placement: Placement, posture: Posture) -> float:
+    """Return the cost of a garment that is not worn: pierced by limbs, around no bone, or slipping down."""
+    points, pierced = placement.apply(sample.points), count_pierced(sample, placement, posture)
+    is_empty = len(sample.openings) > 0 and not _crosses(placement.bones(posture), sample.openings).any()
+    now, lower = (_inside(posture.heights(points - [0.0, drop, 0.0])).mean() for drop in (0.0, _DROP))
+    slips = 1.0 - np.clip((lower - now) / _HELD, 0.0, 1.0)
+    return float(_PIERCED * pierced + _EMPTY * is_empty + _SLIPS * slips)
+
+
+def _crosses(segments: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return which segments, [segments, 2, 3], pierce a triangle."""
+    is_left = triangles.max(axis=1) < segments.min(axis=1)[:, None]
+    is_right = triangles.min(axis=1) > segments.max(axis=1)[:, None]
+    segment, triangle = np.nonzero(~(is_left | is_right).any(axis=2))
+    start, end = segments[segment].transpose(1, 2, 0)
+    corners = triangles[triangle].transpose(1, 2, 0)
+    hits = pierces(tuple(start), tuple(end), [tuple(corner) for corner in corners])
+    return np.isin(np.arange(len(segments)), segment[hits])
+
+
+def _inside(heights: np.ndarray) -> np.ndarray:
+    """Return the cost of every point's depth."""
+    return np.clip(-heights, 0.0, _MAX_INSIDE) / _INSIDE

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from eslr_jax.mesh.topology import face_cross_products, vertex_components, vertex_normals
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pose.motion import SHOULDERS, joint_transforms
 from eslr_jax.types import Body
 
@@ -95,9 +96,7 @@ class Posture:
         distance, side, _ = self.tangent_planes(points)
         return np.where(side < 0, -distance, distance)
 
-    def is_turned_in(
-        self, positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-    ) -> Bool[np.ndarray, " faces"]:
+    def is_turned_in(self, positions: Positions, faces: Faces) -> Bool[np.ndarray, " faces"]:
         """Return which faces belong to a piece that faces the body."""
         _, nearest = self.tree.query(positions[faces].mean(axis=1))
         outward = np.vecdot(face_cross_products(positions, faces), self.normals[self.touchable[nearest]])
@@ -127,7 +126,7 @@ def arm_postures(body: Body) -> list[Posture]:
     postures = [rest_posture(body)]
     for transforms, angle in zip(np.asarray(turned, np.float64), angles, strict=True):
         weights = np.asarray(body.skin_weights, np.float64)
-        blended = _blend(weights, np.asarray(body.skin_indices), transforms)
+        blended = blend(weights, np.asarray(body.skin_indices), transforms)
         posed = np.einsum("vxy,vy->vx", blended[:, :, :3], postures[0].positions) + blended[:, :, 3]
         postures.append(take_posture(body, posed, transforms, angle))
     return postures
@@ -170,27 +169,13 @@ def shoulder_height(body: Body) -> float:
     return float(heights.min() + SHOULDERS * np.ptp(heights[~is_aside]))  # without raised arms
 
 
-def unpose(
-    positions: Float[np.ndarray, "vertices 3"],
-    skin_weights: Float[np.ndarray, "vertices influences"],
-    skin_indices: Int[np.ndarray, "vertices influences"],
-    transforms: Float[np.ndarray, "joints 3 4"],
-) -> Float[np.ndarray, "vertices 3"]:
-    """Undo linear blend skinning: return the rest positions that blended maps take to posed positions [m]."""
-    blended = _blend(skin_weights, skin_indices, transforms)
-    return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]
-
-
-def _blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+def blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> np.ndarray:
     """Return the blended map of every vertex, shape [vertices, 3, 4]."""
     return np.einsum("vi,vixy->vxy", weights, transforms[indices])
 
 
 def take_posture(
-    body: Body,
-    positions: Float[np.ndarray, "body_vertices 3"],
-    transforms: Float[np.ndarray, "joints 3 4"],
-    arm_angle: float | None = None,
+    body: Body, positions: np.ndarray, transforms: np.ndarray, arm_angle: float | None = None
 ) -> Posture:
     """Return a body in a pose, given its vertices there [m] and the maps of its joints to it; see `Posture`."""
     transforms = np.asarray(transforms, np.float64)

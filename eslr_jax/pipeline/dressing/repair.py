@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from eslr_jax.mesh.topology import face_areas, half_edges, undirected_edges, vertex_components, vertex_normals
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 
 _AROUND = 12  # nearest vertices, one of which is on a shell's other side
 _OPPOSED = 0.5  # cosine between the normals of its two sides
@@ -21,15 +22,13 @@ _OPPOSED = 0.5  # cosine between the normals of its two sides
 class Cleaned:
     """A repaired mesh, and the source of its vertices and faces."""
 
-    positions: Float[np.ndarray, "vertices 3"]
-    faces: Int[np.ndarray, "faces 3"]
+    positions: Positions
+    faces: Faces
     vertex_map: Int[np.ndarray, " source_vertices"]  # new vertex of every source vertex; -1: dropped
     face_source: Int[np.ndarray, " faces"]  # source face of every new face
 
 
-def weld(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, tolerance: float = 1e-5
-) -> Cleaned:
+def weld(positions: Positions, faces: Faces, *, tolerance: float = 1e-5) -> Cleaned:
     """Join coincident boundary vertices, then drop collapsed faces, repeated faces and loose vertices.
 
     Boundary vertices are joined, and those of faces that coincide whole, as the two sides of a double-sided mesh.
@@ -46,11 +45,7 @@ def weld(
     return merge_vertices(positions, faces, pairs[is_joined[pairs].all(axis=1)])
 
 
-def merge_vertices(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    pairs: Int[np.ndarray, "pairs 2"],
-) -> Cleaned:
+def merge_vertices(positions: Positions, faces: Faces, pairs: Int[np.ndarray, "pairs 2"]) -> Cleaned:
     """Join the given pairs of vertices; a chain of pairs becomes its first vertex. See `weld`."""
     merged = _first_of_groups(len(positions), pairs)
     joined = merged[faces]
@@ -67,9 +62,7 @@ def _first_of_groups(count: int, pairs: np.ndarray) -> np.ndarray:
     return np.asarray(first)[label]
 
 
-def shell_thickness(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> float | None:
+def shell_thickness(positions: Positions, faces: Faces) -> float | None:
     """Return how far the two sides of a closed thin shell are apart in the median; None of any other mesh.
 
     The unit is that of the positions. A vertex of a shell has one of opposed normal among its nearest, nearer
@@ -87,9 +80,7 @@ def shell_thickness(
     return thickness if thickness < usual else None
 
 
-def join_components(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gap: float
-) -> Cleaned:
+def join_components(positions: Positions, faces: Faces, gap: float) -> Cleaned:
     """Sew separate parts together where their boundaries come within `gap` of each other.
 
     Every boundary vertex is joined to the nearest boundary vertex of another part. Where one boundary has more
@@ -100,9 +91,7 @@ def join_components(
     return merge_vertices(positions, faces, pairs[distances <= gap])
 
 
-def shares_along_seams(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gaps: Sequence[float]
-) -> list[float]:
+def shares_along_seams(positions: Positions, faces: Faces, gaps: Sequence[float]) -> list[float]:
     """Return the share of all boundary vertices that have a boundary of another part within each of some gaps."""
     _, distances = _seam_pairs(positions, faces)
     return [float(np.sum(distances <= gap)) / max(len(distances), 1) for gap in gaps]
@@ -125,9 +114,7 @@ def _seam_pairs(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     return pairs, distances
 
 
-def largest_component(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Cleaned:
+def largest_component(positions: Positions, faces: Faces) -> Cleaned:
     """Keep the connected part with the largest area."""
     _, component = vertex_components(faces, len(positions))
     owner = component[faces[:, 0]]
@@ -135,9 +122,7 @@ def largest_component(
     return _select_faces(positions, faces, np.flatnonzero(owner == largest), np.arange(len(positions)))
 
 
-def consistent_orientation(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Bool[np.ndarray, " faces"]:
+def consistent_orientation(positions: Positions, faces: Faces) -> Bool[np.ndarray, " faces"]:
     """Return which faces to turn so that neighbours agree; most of each part's area stays unturned.
 
     Edges with more than two faces and one-sided surfaces are left for `validate_mesh` to refuse.

@@ -30,6 +30,7 @@ from eslr_jax.pipeline.dressing.postures import Posture, rest_posture
 from eslr_jax.pipeline.dressing.report import wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape, pose_alike
 from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Positions
 from eslr_jax.pipeline.formats.pattern import Pattern
 from eslr_jax.pipeline.rigs.rig import body_skeleton
 from eslr_jax.pose.joints import find_parts
@@ -61,26 +62,13 @@ _RAYS, _RINGS, _RING = 24, 30, 0.01  # directions, and steps [m], in which a pla
 
 
 def sew_pattern(
-    pattern: Pattern,
-    body: Body,
-    made_for: Body,
-    *,
-    num_vertices: int = 1000,
-    pin: tuple[str, ...] = (),
-    name: str = "pattern",
+    pattern: Pattern, body: Body, made_for: Body, *, num_vertices: int, pin: tuple[str, ...], name: str
 ) -> GarmentFile:
     """Cut a pattern's panels, sew them around the body that they are made for, and carry the garment to a body.
 
-    Args:
-        pattern: Panels that stand around a body whose feet are at the origin.
-        body: Who wears the garment.
-        made_for: The body that the pattern is made for; the same object if that is the wearer.
-        num_vertices: About how many vertices the garment is to have.
-        pin: Vertices that follow the body, see `FitOptions.pin`; a panel is a part.
-        name: Name of the garment in messages.
-
-    Returns:
-        The garment; `metadata["sewing"]` reports on it and holds the vertices of every seam.
+    The panels stand around a body whose feet are at the origin, `made_for`, which is the same object if it is the
+    wearer. The garment has about `num_vertices`; `pin` is that of `FitOptions`, a panel a part.
+    `metadata["sewing"]` reports on it and holds the vertices of every seam. Messages say its `name`.
 
     Raises:
         MeshError: The panels stand elsewhere, can't be cut or joined, or can't be carried to the body.
@@ -101,28 +89,21 @@ def sew_pattern(
     if made_for is not body:
         placed, lengths, worn_in, carried = carry_shape(draped, faces, posture, made_for, body, scale="body")
         corners, transfer = _recut(corners, draped[faces], lengths[faces]), {"transfer": carried}
-    rest, weights, indices, penetration = lay_to_rest(placed, faces, worn_in, body)
-    is_pinned, pinned_by, falling = choose_pins(
-        pin,
-        np.zeros(len(rest), bool),
-        body,
-        positions=rest,
+    worn, penetration = lay_to_rest(placed, faces, worn_in, body)
+    garment = GarmentFile(
+        **worn,
         faces=faces,
-        vertex_map=np.arange(len(rest)),
-        face_parts=mesh.face_panels,
-        part_names=tuple(pattern.panels),
-    )
-    return GarmentFile(
-        rest_positions=rest,
-        faces=faces,
-        skin_weights=weights,
-        skin_indices=indices,
-        is_pinned=is_pinned,
+        is_pinned=np.zeros(len(placed), bool),
         sewn_positions=placed,
         panel_corners=corners,
         corner_uvs=_laid_out(mesh.face_panels, corners),
         face_parts=mesh.face_panels,
         part_names=tuple(pattern.panels),
+    )
+    is_pinned, pinned_by, falling = choose_pins(pin, garment, body)
+    return dataclasses.replace(
+        garment,
+        is_pinned=is_pinned,
         metadata={
             "name": name,
             **wearer_entry(body),
@@ -143,7 +124,6 @@ def sew_pattern(
 
 
 def _check_place(mesh: SewnMesh, pattern: Pattern, posture: Posture, name: str) -> None:
-    """Raise a MeshError if a panel does not stand around the body."""
     height = float(np.ptp(posture.positions[:, 1]))
     for number, panel in enumerate(pattern.panels):
         place = mesh.placed[np.unique(mesh.faces[mesh.face_panels == number])]
@@ -156,9 +136,7 @@ def _check_place(mesh: SewnMesh, pattern: Pattern, posture: Posture, name: str) 
             )
 
 
-def _judge(
-    mesh: SewnMesh, draped: Float[np.ndarray, "vertices 3"], pattern: Pattern
-) -> tuple[list[str], dict[str, Any]]:
+def _judge(mesh: SewnMesh, draped: Positions, pattern: Pattern) -> tuple[list[str], dict[str, Any]]:
     """Return warnings of what lies badly after sewing, and figures."""
     stretched, names = stretches(mesh, draped), list(pattern.panels)
     owners, _, pierced = piercing_edges(draped, mesh.faces)
@@ -199,16 +177,12 @@ def _recut(
     new: Float[np.ndarray, "faces 3 3"],
 ) -> Float[np.ndarray, "faces 3 2"]:
     """Return the corners of flat faces [m], stretched as the faces of a shape in space are from old to new."""
-
-    def metric(points: np.ndarray) -> np.ndarray:
-        edges = np.stack([points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]], axis=2)
-        return edges.swapaxes(1, 2) @ edges
-
-    flat = np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
-    lower = np.linalg.cholesky(metric(old))
+    flat, before, after = map(_edges, (corners, old, new))
+    lower = np.linalg.cholesky(before.swapaxes(1, 2) @ before)
     inverse = np.linalg.inv(lower)
     # In the frame of the old face, whose edges are lower^T; its stretch is the root of the pulled-back metric.
-    values, vectors = np.linalg.eigh(inverse @ metric(new) @ inverse.swapaxes(1, 2))
+    metric = after.swapaxes(1, 2) @ after
+    values, vectors = np.linalg.eigh(inverse @ metric @ inverse.swapaxes(1, 2))
     root = vectors @ (np.sqrt(values)[:, :, None] * vectors.swapaxes(1, 2))
     turn = flat @ inverse.swapaxes(1, 2)  # from that frame to the panel's
     edges = turn @ root @ lower.swapaxes(1, 2)
@@ -247,7 +221,7 @@ def pattern_posture(body: Body) -> Posture:
         return rest_posture(body)
 
 
-def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
+def drape(mesh: SewnMesh, posture: Posture) -> Positions:
     """Return the vertices of a sewn mesh where its cloth lies around a body [m]."""
     columns, areas = _frames(mesh)
     num_vertices, num_faces = len(mesh.placed), len(mesh.faces)
@@ -282,9 +256,7 @@ def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
     return uncrossed(position, mesh.faces)
 
 
-def _beside(
-    points: Float[np.ndarray, "vertices 3"], spans: Float[np.ndarray, "vertices 3"], posture: Posture
-) -> Float[np.ndarray, "vertices 3"]:
+def _beside(points: Positions, spans: Positions, posture: Posture) -> Positions:
     """Return points, of which those of seams that begin in the body stand beside it [m].
 
     A seam between a panel before and one behind the body belongs to its outline as seen from there. So it leaves
@@ -320,15 +292,17 @@ def _heights(
 
 def _frames(mesh: SewnMesh) -> tuple[Float[np.ndarray, "faces 3 2"], Float[np.ndarray, " faces"]]:
     """Return what each corner adds to the columns of its face's deformation gradient [1/m], and areas [m2]."""
-    corners = mesh.panel_corners
-    edges = np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
-    inverse = np.linalg.inv(edges)
-    return np.concatenate([inverse, -inverse.sum(axis=1, keepdims=True)], axis=1), 0.5 * np.abs(
-        np.linalg.det(edges)
-    )
+    edges = _edges(mesh.panel_corners)
+    inverse, areas = np.linalg.inv(edges), 0.5 * np.abs(np.linalg.det(edges))
+    return np.concatenate([inverse, -inverse.sum(axis=1, keepdims=True)], axis=1), areas
 
 
-def stretches(mesh: SewnMesh, position: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, " faces"]:
+def _edges(corners: np.ndarray) -> np.ndarray:
+    """Return the two edges of every face that end in its last corner, as columns."""
+    return np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
+
+
+def stretches(mesh: SewnMesh, position: Positions) -> Float[np.ndarray, " faces"]:
     """Return the largest stretch of every face."""
     columns, _ = _frames(mesh)
     deformed = np.einsum("fck,fcx->fkx", columns, position[mesh.faces])

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float, Int
 from scipy.interpolate import RBFInterpolator
 from scipy.sparse.linalg import splu
 
@@ -18,6 +17,7 @@ from eslr_jax.pipeline.dressing.options import Scale
 from eslr_jax.pipeline.dressing.postures import Posture, rest_posture, take_posture
 from eslr_jax.pipeline.dressing.report import wearer_entry
 from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pipeline.rigs.alignment import align_rests
 from eslr_jax.pipeline.rigs.rig import body_skeleton
 from eslr_jax.pose.joints import Part, find_parts
@@ -67,26 +67,18 @@ def transfer_garment(
     placed, sewn, posture, report = carry_shape(
         garment.rest_positions, garment.faces, rest_posture(source), source, target, scale=scale
     )
-    rest, weights, indices, _ = lay_to_rest(placed, garment.faces, posture, target)
+    worn, _ = lay_to_rest(placed, garment.faces, posture, target)
     return dataclasses.replace(
         garment,
-        rest_positions=rest,
-        skin_weights=weights,
-        skin_indices=indices,
+        **worn,
         sewn_positions=sewn,
         metadata=garment.metadata | wearer_entry(target) | {"transfer": report},
     )
 
 
 def carry_shape(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    source: Posture,
-    made_for: Body,
-    target: Body,
-    *,
-    scale: Scale,
-) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"], Posture, dict[str, Any]]:
+    positions: Positions, faces: Faces, source: Posture, made_for: Body, target: Body, *, scale: Scale
+) -> tuple[Positions, Positions, Posture, dict[str, Any]]:
     """Carry a garment's shape [m] from a posed body, `source`, to another body in the same pose.
 
     A spline through the joints and the crotch maps space from one body to the other. Then the cloth moves along
@@ -151,7 +143,7 @@ def pose_alike(body: Body, skeleton: Skeleton) -> Posture:
                 )
     ours = {part: joints for part, joints in ours.items() if part in theirs}
     try:
-        turned = align_rests(own, skeleton, ours, theirs, "of the garment")
+        turned = align_rests(own, skeleton, ours, theirs)
     except MotionError as error:
         raise MeshError(
             "no garment can be carried to a body that does not stand at rest; export it in a T-pose or A-pose"

@@ -3,10 +3,16 @@
 Vertices keep their order and their float32. Corners turn clockwise in Alembic: they are reversed both ways. It
 knows no unit, no skeleton and no material: metres are written with Y up, every mesh as points, parts of a garment
 as face sets. In a file with several meshes FILE#MESH,MESH names those to read.
+
+A damaged file may crash the library, so that the script `apart/alembic.py` reads in a process of its own.
 """
 
 from __future__ import annotations
 
+import itertools
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +21,10 @@ import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.files.atomic import atomic_write
+from eslr_jax.files.npz import read_arrays
 from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, identifiers, vertex_normals
-from eslr_jax.pipeline.formats.apart import read_apart
-from eslr_jax.pipeline.formats.mesh import MeshFile, cut_polygons, name_parts
+from eslr_jax.pipeline.formats.mesh import MeshFile, cut_polygons, join_meshes, name_parts
 from eslr_jax.pipeline.formats.mesh_sequence import DEFAULT_FPS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader, writer
 from eslr_jax.pose.skeleton import MAX_FRAMES, whole_rate
@@ -94,14 +100,12 @@ def read_alembic_garment(path: Path, names: str = "") -> MeshFile:
     """Read the first sample of all meshes, or of some, as one garment, whose parts are face sets or meshes."""
     arrays = _read(path, names, 1)
     meshes = [_mesh(arrays, number, path) for number in range(len(arrays["names"]))]
-    counts = np.cumsum([0, *(positions.shape[1] for positions, *_ in meshes)])
-    uvs = [uvs for _, _, uvs, _ in meshes if uvs is not None]
-    own = [str(name) for name, (_, faces, *_) in zip(arrays["names"], meshes, strict=True) for _ in faces]
-    face_parts, part_names = name_parts([[part for *_, parts in meshes for part in parts], own])
+    positions, faces, uvs, parts = zip(*meshes, strict=True)
+    own = [str(name) for name, own in zip(arrays["names"], faces, strict=True) for _ in own]
+    face_parts, part_names = name_parts([list(itertools.chain(*parts)), own])
     return MeshFile(
-        positions=np.concatenate([positions[0] for positions, *_ in meshes]),
-        faces=np.concatenate([faces + count for (_, faces, *_), count in zip(meshes, counts, strict=False)]),
-        corner_uvs=np.concatenate(uvs) if len(uvs) == len(meshes) else None,
+        *join_meshes([moving[0] for moving in positions], faces),
+        corner_uvs=None if any(one is None for one in uvs) else np.concatenate(uvs),
         face_parts=face_parts,
         part_names=part_names,
         name=names.replace(",", "_") or path.stem,
@@ -132,9 +136,21 @@ def read_alembic_sequences(path: Path, names: str = "", fps: float | None = None
 
 
 def _read(path: Path, names: str, frames: int) -> dict[str, np.ndarray]:
-    """Return the arrays of `apart/alembic.py`."""
+    """Return the arrays of `apart/alembic.py`, whose `sys.exit` is what a person must know of the file."""
     require("alembic3d", extra="alembic", purpose="Alembic")
-    return read_apart("alembic", path, names, frames)
+    script = Path(__file__).with_name("apart") / "alembic.py"
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "arrays.npz"
+        # -P: Python would look for its own modules beside the script first.
+        command = [sys.executable, "-P", script, path, out, names, str(frames)]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, errors="replace")
+        if done.returncode == 0:
+            return read_arrays(out, content="alembic")
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    if done.returncode == 1 and "Traceback (most recent call last)" not in done.stderr:
+        raise AssetError(f"{path}: {last}")
+    cause = last[:200] if done.returncode == 1 else "its reader crashed"
+    raise AssetError(f"{path} is damaged or no alembic file ({cause}); export it again")
 
 
 def _mesh(

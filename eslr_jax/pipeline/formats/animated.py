@@ -25,7 +25,7 @@ _RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float
 _FLAT = 0.05  # determinant of blended rotations below which a vertex can't be moved in every direction
 # A skin weight that moves a vertex by less than float32 resolves over a body's size.
 _NEGLIGIBLE_WEIGHT = 1e-6
-_LAYOUT = {  # of an AnimatedMesh and its Skin
+MESH_LAYOUT = {  # of an AnimatedMesh and its Skin
     "positions": ("f", "frames vertices 3"),
     "faces": ("iu", "faces 3", "vertices"),
     "corner_uvs": ("f", "faces 3 2"),
@@ -78,8 +78,7 @@ def check_moving(
 ) -> None:
     """Raise a MeshError, or `not_finite`, unless arrays are a mesh over time; see `check_layout`."""
     arrays = {"positions": positions, "faces": faces}
-    layout = {name: _LAYOUT[name] for name in arrays}
-    check_layout(arrays, layout, what=what, remedy=remedy, error=MeshError)
+    check_layout(arrays, MESH_LAYOUT, what=what, remedy=remedy, error=MeshError)
     if 0 in positions.shape or not len(faces):
         raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
     is_finite = np.isfinite(positions).all((1, 2))
@@ -95,14 +94,9 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
         raise MeshError("no mesh to write; give at least one")
     for mesh in meshes:
         what, remedy = f"mesh {mesh.name}", "simulate it again"
-        arrays = {
-            key: np.asarray(value)
-            for key, value in vars(mesh).items()
-            if key in _LAYOUT and value is not None
-        }
-        if mesh.skin is not None:
-            arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
-        check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+        values = vars(mesh) | ({} if mesh.skin is None else vars(mesh.skin))
+        arrays = {key: np.asarray(values[key]) for key in MESH_LAYOUT if values.get(key) is not None}
+        check_layout(arrays, MESH_LAYOUT, what=what, remedy=remedy, error=MeshError)
         check_moving(arrays["positions"], arrays["faces"], what=what, remedy=remedy)
         if mesh.skin is None:
             continue
@@ -155,19 +149,16 @@ def split_seams(
     corners = faces.reshape(-1)
     values = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
     keys = np.concatenate([corners[:, None].astype(np.float64), values.astype(np.float64)], axis=1)
-    unique, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    owner = unique[:, 0].astype(np.int64)
-    order = np.lexsort([first, owner])  # of each vertex the coordinate that comes first in the file
-    is_first = np.ones(len(order), bool)
-    is_first[1:] = owner[order][1:] != owner[order][:-1]
-    place = np.empty(len(order), np.int64)
-    place[order[is_first]] = owner[order[is_first]]
-    extra = order[~is_first]
-    extra = extra[np.argsort(first[extra], kind="stable")]
-    place[extra] = num_vertices + np.arange(len(extra))
-    uvs = np.zeros((num_vertices + len(extra), 2), np.float32)
-    uvs[place] = unique[:, 1:]
-    return place[inverse.ravel()].reshape(-1, 3), np.concatenate([np.arange(num_vertices), owner[extra]]), uvs
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # as they come in the file
+    owner = corners[first[order]]
+    is_extra = np.ones(len(owner), bool)
+    is_extra[np.unique(owner, return_index=True)[1]] = False  # the first coordinate of each vertex
+    place = np.where(is_extra, num_vertices - 1 + np.cumsum(is_extra), owner)
+    uvs = np.zeros((num_vertices + np.sum(is_extra), 2), np.float32)
+    uvs[place] = values[first[order]]
+    split = place[np.argsort(order)[inverse.ravel()]].reshape(-1, 3)
+    return split, np.concatenate([np.arange(num_vertices), owner[is_extra]]), uvs
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -236,12 +227,12 @@ def local_motion(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
     return rotations.astype(np.float32), translations.astype(np.float32)
 
 
-def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """Return what to add to the rest vertices so that the joints move them to given positions [m].
+def corrections(mesh: AnimatedMesh, skin: Skin, tolerance: float) -> np.ndarray | None:
+    """Return what to add to a mesh's vertices at rest so that the joints of its skin move them to their places.
 
-    Returns:
-        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance [m].
+    That is offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance [m].
     """
+    rest, positions = (np.asarray(part, np.float32) for part in (mesh.rest_positions, mesh.positions))
     weights, indices = influences(skin)
     rows = np.repeat(np.arange(len(rest)), weights.shape[1])
     blend = scipy.sparse.csr_array((weights.ravel(), (rows, indices.ravel())), (len(rest), len(skin.parents)))

@@ -163,11 +163,8 @@ def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
             f"{num_frames * num_channels}"
         )
     if rows != num_frames:  # some exporters count wrongly
-        warnings.warn(
-            f"motion file {words.path} says {num_frames} frames and has {rows}; all {rows} are read",
-            UserWarning,
-            stacklevel=4,
-        )
+        warning = f"motion file {words.path} says {num_frames} frames and has {rows}; all {rows} are read"
+        warnings.warn(warning, stacklevel=4)
     values = np.array(text, np.float64).reshape(rows, num_channels)
     is_bad = ~np.isfinite(values).all(axis=1)
     if is_bad.any():

@@ -16,7 +16,7 @@ from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.files.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.files.parsing import split_name
 from eslr_jax.mesh.topology import unique_edges
-from eslr_jax.pipeline.formats.mesh import MeshFile, read_mesh_file, shared_vertices
+from eslr_jax.pipeline.formats.mesh import Faces, MeshFile, read_mesh_file, shared_vertices
 from eslr_jax.pipeline.formats.mesh_sequence import MeshSequence
 from eslr_jax.pipeline.formats.registry import find_reader, suffixes_of
 
@@ -72,9 +72,7 @@ class GarmentFile:
         return [text for key in ("fit", "sewing") for text in self.metadata.get(key, {}).get("warnings", [])]
 
 
-def split_outfit(
-    faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]
-) -> list[tuple[str, slice, Bool[np.ndarray, " faces"]]]:
+def split_outfit(faces: Faces, outfit: dict[str, int]) -> list[tuple[str, slice, Bool[np.ndarray, " faces"]]]:
     """Return of the garments of a `GarmentFile.outfit` the name, the vertices and which of all faces."""
     garments, start = [], 0
     for name, count in outfit.items():

@@ -17,16 +17,7 @@ import numpy as np
 import pygltflib as gltf
 
 from eslr_jax.files.atomic import atomic_write
-from eslr_jax.pipeline.formats.animated import (
-    AnimatedMesh,
-    Skin,
-    corrections,
-    influences,
-    local_motion,
-    principal_shapes,
-    split_seams,
-    vertex_normals,
-)
+from eslr_jax.pipeline.formats import animated
 from eslr_jax.pipeline.formats.palette import Color, srgb_to_linear
 from eslr_jax.pipeline.formats.registry import writer
 
@@ -44,7 +35,7 @@ _COMPONENT_TYPES = {
 
 
 @writer("scene", [".glb"])
-def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
+def write_animated_glb(path: str | Path, meshes: Sequence[animated.AnimatedMesh], timestep: float) -> None:
     """Write meshes with their animation as one GLB file, atomically; frame k is at k times the timestep [s]."""
     builder = _Builder()
     for mesh in meshes:
@@ -54,39 +45,38 @@ def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timeste
         temporary.write_bytes(content)
 
 
-def _add_mesh(builder: _Builder, mesh: AnimatedMesh, timestep: float) -> None:
+def _add_mesh(builder: _Builder, mesh: animated.AnimatedMesh, timestep: float) -> None:
     """Add a mesh with its skin, its morph targets and their animation."""
     positions, faces = np.asarray(mesh.positions, np.float32), np.asarray(mesh.faces)
     base, offsets = positions[0], positions - positions[0]
     if mesh.skin is not None:
         base = np.asarray(mesh.rest_positions, np.float32)
-        needed = corrections(mesh.skin, base, positions, TOLERANCE)
+        needed = animated.corrections(mesh, mesh.skin, TOLERANCE)
         offsets = np.zeros((len(positions), 0, 3)) if needed is None else needed
-    split, vertices, uvs = split_seams(faces, len(base), mesh.corner_uvs)
+    split, vertices, uvs = animated.split_seams(faces, len(base), mesh.corner_uvs)
     attributes = gltf.Attributes(
         POSITION=builder.add_points(base[vertices]),
-        NORMAL=builder.add_vertices(vertex_normals(base, faces)[vertices], gltf.VEC3),
+        NORMAL=builder.add_vertices(animated.vertex_normals(base, faces)[vertices], gltf.VEC3),
     )
     if uvs is not None:
         flipped = uvs * [1, -1] + [0, 1]  # glTF counts v from the top
         attributes.TEXCOORD_0 = builder.add_vertices(flipped.astype(np.float32), gltf.VEC2)
     skin = None
     if mesh.skin is not None:
-        weights, indices = (array[vertices] for array in influences(mesh.skin))
+        weights, indices = (array[vertices] for array in animated.influences(mesh.skin))
         padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
         dtype = np.uint8 if len(mesh.skin.parents) <= np.iinfo(np.uint8).max else np.uint16
-        for name, values in (
-            ("JOINTS", np.pad(indices, padding).astype(dtype)),
-            ("WEIGHTS", np.pad(weights, padding).astype(np.float32)),
-        ):
-            for number in range(values.shape[1] // _INFLUENCES_PER_SET):
-                part = values[:, number * _INFLUENCES_PER_SET : (number + 1) * _INFLUENCES_PER_SET]
+        for name, values, kind in (("JOINTS", indices, dtype), ("WEIGHTS", weights, np.float32)):
+            padded = np.pad(values, padding).astype(kind)
+            for number, part in enumerate(np.split(padded, padded.shape[1] // _INFLUENCES_PER_SET, axis=1)):
                 setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
         skin = _add_skin(builder, mesh.name, mesh.skin, timestep)
     targets, weights = _add_targets(builder, base, offsets, faces, vertices)
+    # The smallest type that can't be taken for a primitive restart.
+    corners = split.reshape(-1).astype(np.uint16 if len(vertices) < np.iinfo(np.uint16).max else np.uint32)
     primitive = gltf.Primitive(
         attributes=attributes,
-        indices=builder.add_indices(split, len(vertices)),
+        indices=builder.add_accessor(corners, gltf.SCALAR, target=gltf.ELEMENT_ARRAY_BUFFER),
         material=builder.add_material(mesh.name, mesh.color),
         targets=targets,
     )
@@ -113,14 +103,17 @@ def _add_targets(
     """
     if not offsets.size:
         return [], np.zeros((len(offsets), 0), np.float32)
-    basis, shapes = principal_shapes(offsets, TOLERANCE)
-    rest = vertex_normals(base, faces)
-    normals = np.stack([vertex_normals(base + offset, faces) - rest for offset in offsets])
+    basis, shapes = animated.principal_shapes(offsets, TOLERANCE)
+    rest = animated.vertex_normals(base, faces)
+    normals = np.stack([animated.vertex_normals(base + offset, faces) - rest for offset in offsets])
     turned = np.tensordot(basis, normals, axes=(0, 0))
     # The basis is orthonormal: what the first shapes leave of the normals is the sum of the others' squares.
     left = np.cumsum(np.sum(turned * turned, axis=(1, 2))[::-1])[::-1] / normals[..., 0].size
     num_turned = int(np.sum(left > _NORMAL_TOLERANCE**2))
-    still = builder.add_zeros(len(vertices)) if num_turned < len(shapes) else None
+    still = None
+    if num_turned < len(shapes):  # zeros, which take no room
+        zeros = gltf.Accessor(componentType=gltf.FLOAT, count=len(vertices), type=gltf.VEC3)
+        still = _append(builder.document.accessors, zeros)
     largest = np.abs(basis).max(0)
     targets = []
     for number, (shape, normal) in enumerate(zip(shapes, turned, strict=True)):
@@ -139,9 +132,9 @@ def _add_targets(
     return targets, (basis / largest).astype(np.float32)
 
 
-def _add_skin(builder: _Builder, name: str, skin: Skin, timestep: float) -> int:
+def _add_skin(builder: _Builder, name: str, skin: animated.Skin, timestep: float) -> int:
     """Add one animated node per joint under a common root, and return the skin that binds them."""
-    rotations, translations = local_motion(skin)
+    rotations, translations = animated.local_motion(skin)
     parents, first = list(skin.parents), len(builder.document.nodes)
     for joint, label in enumerate(skin.joint_names):
         node = gltf.Node(
@@ -218,31 +211,18 @@ class _Builder:
         index = self.add_vertices(rounded, gltf.VEC3)
         accessor = self.document.accessors[index]
         accessor.normalized = True
-        accessor.min = rounded[:, :3].min(axis=0).tolist()
-        accessor.max = rounded[:, :3].max(axis=0).tolist()
+        accessor.min, accessor.max = (end(rounded[:, :3], axis=0).tolist() for end in (np.min, np.max))
         self.document.bufferViews[accessor.bufferView].byteStride = rounded.itemsize * rounded.shape[1]
         self.document.extensionsUsed = self.document.extensionsRequired = ["KHR_mesh_quantization"]
         return index
-
-    def add_zeros(self, num_vertices: int) -> int:
-        """Add vectors of zeros, which take no room."""
-        accessor = gltf.Accessor(componentType=gltf.FLOAT, count=num_vertices, type=gltf.VEC3)
-        return _append(self.document.accessors, accessor)
 
     def add_vertices(self, values: np.ndarray, kind: str) -> int:
         """Add other values per vertex, such as normals."""
         return self.add_accessor(values, kind, target=gltf.ARRAY_BUFFER)
 
-    def add_indices(self, faces: np.ndarray, num_vertices: int) -> int:
-        """Add the triangles, in the smallest type that can't be taken for a primitive restart."""
-        dtype = np.uint16 if num_vertices < np.iinfo(np.uint16).max else np.uint32
-        return self.add_accessor(
-            faces.reshape(-1).astype(dtype), gltf.SCALAR, target=gltf.ELEMENT_ARRAY_BUFFER
-        )
-
     def add_material(self, name: str, color: Color) -> int:
         """Append a rough two-sided material and return its index."""
-        linear = [float(value) for value in srgb_to_linear(color)]
+        linear = srgb_to_linear(color).tolist()
         surface = gltf.PbrMetallicRoughness(
             baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9
         )
@@ -284,6 +264,5 @@ class _Builder:
 
 
 def _append(items: list, item: object) -> int:
-    """Append and return the new item's index."""
     items.append(item)
     return len(items) - 1

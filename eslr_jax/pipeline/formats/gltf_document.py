@@ -286,14 +286,11 @@ class GltfDocument:
             if path == "weights" and values.ndim == 1 and len(values) % (each * len(times)) == 0:
                 values = values.reshape(each * len(times), -1)  # one number a shape
                 width = values.shape[1]
-            if (
-                kind not in ("LINEAR", "STEP", "CUBICSPLINE")
-                or times.ndim != 1
-                or values.shape != (each * len(times), width)
-                or not np.isfinite(times).all()
-                or not np.isfinite(values).all()
-                or (np.diff(times) <= 0).any()
-            ):
+            fits = times.ndim == 1 and values.shape == (each * len(times), width)
+            is_ascending = (
+                np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()
+            )
+            if kind not in ("LINEAR", "STEP", "CUBICSPLINE") or not fits or not is_ascending:
                 raise self.fail(f"has an impossible animation of node {node}'s {path}")
             result.append((node, path, kind, times, values))
         return result

@@ -1,7 +1,8 @@
-"""Read skinned characters and their animations from glTF 2.0 files (.gltf, .glb, .vrm).
+"""Read skinned characters with their animations, and meshes, from glTF 2.0 files (.gltf, .glb, .vrm).
 
-The rest pose is the bind pose. The inverse bind matrices of a skin tell it in the mesh's own space. Exporters
-disagree on how that space lies in the world: see `_bind_space`.
+Meshes are of a scene at rest, or moved by morph targets (shape keys) and nodes. The rest pose of a character is
+the bind pose. The inverse bind matrices of a skin tell it in the mesh's own space. Exporters disagree on how that
+space lies in the world: see `_bind_space`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import numpy as np
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.bundled import pick_clip
-from eslr_jax.pipeline.formats.gltf_document import GltfDocument, sample_keys
+from eslr_jax.pipeline.formats.gltf_document import MOVES, TRIANGLES, GltfDocument, sample_keys
+from eslr_jax.pipeline.formats.mesh import MeshFile, join_meshes, name_parts, shared_vertices, stack_tables
+from eslr_jax.pipeline.formats.mesh_sequence import MAX_POINTS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader
 from eslr_jax.pose.skeleton import (
     MAX_POSES,
@@ -57,7 +60,10 @@ def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     """
     document = GltfDocument(path)
     joints = read_joints(document)
-    carriers = {node: _carrier(document, joints, node) for node in range(len(document.parents))}
+    carriers: dict[int, int | None] = {-1: None}  # the joint that a node hangs on
+    for node in document.order:
+        is_joint = node in joints.nodes
+        carriers[node] = joints.nodes.index(node) if is_joint else carriers[document.parents[node]]
     found = {}  # nodes of the body, and the names they go by
     for index, node in enumerate(document.items("nodes")):
         if "mesh" in node and ("skin" in node or carriers[index] is not None):
@@ -71,19 +77,12 @@ def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     parts = [part for node in nodes for part in _read_node(document, joints, node, carriers[node])]
     if not parts:
         raise AssetError(f"{path} has a skin, but no triangles bound to it; export the mesh with its skin")
-    offsets = np.cumsum([0, *(len(part[0]) for part in parts)])
-    influences = max(part[2].shape[1] for part in parts)
     positions, faces, weights, indices = zip(*parts, strict=True)
-
-    def widen(array: np.ndarray) -> np.ndarray:
-        return np.pad(array, ((0, 0), (0, influences - array.shape[1])))
-
     return RiggedMesh(
-        name=path.name,
-        positions=np.concatenate(positions),
-        faces=np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=False)]),
-        skin_weights=np.concatenate([widen(part) for part in weights]),
-        skin_indices=np.concatenate([widen(part) for part in indices]),
+        path.name,
+        *join_meshes(positions, faces),
+        skin_weights=stack_tables(weights),
+        skin_indices=stack_tables(indices),
         skeleton=joints.skeleton,
     )
 
@@ -125,11 +124,7 @@ def read_joints(document: GltfDocument) -> _Joints:
     if not skins:
         raise AssetError(f"{document.path} has no skin; give a character that is bound to a skeleton")
     world = document.world_matrices({}, 1)[0]
-    users = {
-        node.get("skin"): index
-        for index, node in reversed(list(enumerate(document.items("nodes"))))
-        if "skin" in node
-    }
+    skinned = [node.get("skin") for node in document.items("nodes")]
     frames: dict[int, np.ndarray] = {}
     spaces: dict[int, np.ndarray] = {}
     for number, skin in enumerate(skins):
@@ -148,7 +143,7 @@ def read_joints(document: GltfDocument) -> _Joints:
             bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
         if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
             raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
-        user = users.get(number)
+        user = skinned.index(number) if number in skinned else None
         spaces[number] = _bind_space(document, world, nodes, bind, user)
         rest = spaces[number] @ np.linalg.inv(bind)
         for node, frame in zip(nodes, rest, strict=True):
@@ -195,13 +190,6 @@ def _bind_space(
     return best
 
 
-def _carrier(document: GltfDocument, joints: _Joints, node: int) -> int | None:
-    """Return the joint that a node hangs on; None if there is none."""
-    while node >= 0 and node not in joints.nodes:
-        node = document.parents[node]
-    return joints.nodes.index(node) if node >= 0 else None
-
-
 def _read_node(
     document: GltfDocument, joints: _Joints, index: int, carrier: int | None
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
@@ -242,3 +230,122 @@ def _read_node(
             raise document.fail(f"has a skin weight for joint {int(local.max())} of {len(order)}")
         result.append((world, faces, weights, order[local.astype(np.int64)]))
     return result
+
+
+# ---------------------------------------------------------------- meshes
+
+
+@reader("mesh", [".glb", ".gltf"])
+def read_glb(path: Path, _like: MeshFile | None = None) -> MeshFile:
+    """Read all triangles of a glTF file into one mesh, in the scene's frame, and share split vertices.
+
+    Morph targets count as much as their weights at rest say. A mesh with a skin is in its bind pose: glTF has
+    the joints carry it, and its own node count for nothing.
+    """
+    document = GltfDocument(path)
+    world = document.world_matrices({}, 1)[0]
+    has_skin = any("skin" in node and "mesh" in node for node in document.items("nodes"))
+    spaces = read_joints(document).spaces if has_skin else {}
+    positions, corners, uvs, names, materials = [], [], [], [], []
+    for index, node in enumerate(document.items("nodes")):
+        mesh = document.item("meshes", node["mesh"]) if "mesh" in node else {}
+        for primitive in mesh.get("primitives", []):
+            if primitive.get("mode", TRIANGLES) < TRIANGLES:
+                continue  # points and lines
+            points, faces = document.shaped_triangles(node, primitive)
+            space = spaces[node["skin"]] if "skin" in node else world[index]
+            positions.append(points @ space[:3, :3].T + space[:3, 3])
+            corners.append(faces)
+            uv = primitive["attributes"].get("TEXCOORD_0")
+            uvs.append(None if uv is None else document.array(uv) * [1, -1] + [0, 1])  # counted from the top
+            material = document.items("materials")[primitive["material"]] if "material" in primitive else {}
+            names += [str(mesh.get("name", f"mesh{node['mesh']}"))] * len(faces)
+            materials += [str(material.get("name", ""))] * len(faces)
+    if not positions:
+        return MeshFile(np.empty((0, 3)), np.empty((0, 3), np.int64))
+    pairs = zip(uvs, positions, strict=True)
+    known = [uv for uv, points in pairs if uv is not None and len(uv) == len(points)]
+    points, faces = join_meshes(positions, corners)
+    kept, place = shared_vertices(points)
+    face_parts, part_names = name_parts([names, materials])
+    return MeshFile(
+        points[kept],
+        place[faces],
+        corner_uvs=np.concatenate(known)[faces] if len(known) == len(uvs) else None,
+        face_parts=face_parts,
+        part_names=part_names,
+        rows=place,
+        is_metric=True,
+    )
+
+
+@reader("mesh sequence", [".glb", ".gltf"])
+def read_gltf_sequences(path: Path, name: str = "", fps: float | None = None) -> list[MeshSequence]:
+    """Read the meshes that morph targets and nodes move, all or those of a name."""
+    document = GltfDocument(path)
+    animations = document.items("animations")
+    shapes = {key[0]: key for entry in animations for key in document.key_frames(entry, ("weights",))}
+    nodes = {node: document.item("nodes", node) for node in shapes}
+    found = {
+        node: str(entry.get("name") or document.item("meshes", entry.get("mesh")).get("name"))
+        for node, entry in nodes.items()
+        if "skin" not in entry  # a body
+    }
+    chosen = [node for node, known in found.items() if name in ("", known)]
+    if not chosen:
+        known = ", ".join(found.values()) or "none"
+        raise AssetError(
+            f"{path}: no mesh{name and f' named {name!r}'} is moved by shapes; it has {known}; export the "
+            "garment with its shape keys"
+        )
+    # Animations of other nodes, such as a character's, may be as many as they like.
+    carriers = set()
+    for node in chosen:
+        while node >= 0 and node not in carriers:
+            carriers.add(node)
+            node = document.parents[node]
+    clips = [
+        {key[:2] for key in document.key_frames(entry, (*MOVES, "weights")) if key[0] in carriers}
+        for entry in document.items("animations")
+    ]
+    clips = [keyed for keyed in clips if keyed]
+    if sum(map(len, clips)) > len(set().union(*clips)):
+        raise AssetError(f"{document.path} holds {len(clips)} clips; export one")
+    at, rate = document.sample_times([shapes[node][3] for node in chosen], fps)
+    moves = [key for entry in animations for key in document.key_frames(entry)]
+    moved = {
+        (node, path): sample_keys(path, how, keys, at_keys, at) for node, path, how, keys, at_keys in moves
+    }
+    world = document.world_matrices(moved, len(at))
+    sequences = []
+    for node in chosen:
+        _, _, kind, times, values = shapes[node]
+        weights = sample_keys("weights", kind, times, values, at)
+        positions, faces = _moved_by_shapes(document, nodes[node]["mesh"], weights, world[:, node])
+        label = path.name if len(found) == 1 else f"{path.name}#{found[node]}"
+        sequences.append(MeshSequence(label, positions, faces, rate, found[node]))
+    return sequences
+
+
+def _moved_by_shapes(
+    document: GltfDocument, mesh: int, weights: np.ndarray, world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [frames, vertices, 3] and faces of a mesh; vertices that were split at seams become one.
+
+    `weights` are of its shapes, [frames, shapes]; `world` leads from its own space, [frames, 4, 4].
+    """
+    parts, corners = [], []
+    for primitive in document.item("meshes", mesh).get("primitives", []):
+        points, triangles = document.triangles(primitive)
+        offsets = [document.offsets(target, points.shape) for target in primitive.get("targets", [])]
+        parts.append(np.stack([points, *offsets], axis=1))
+        corners.append(triangles)
+    shapes, faces = join_meshes(parts, corners)  # of every vertex the place, then the offsets of each shape
+    count, num_shapes = len(shapes), shapes.shape[1] - 1
+    if weights.shape[1] != num_shapes or len(weights) * count > MAX_POINTS:
+        raise document.fail(f"has {weights.shape[1]} weights for {num_shapes} shapes of a mesh")
+    kept, place = shared_vertices(shapes)
+    shapes = shapes[kept].swapaxes(0, 1)
+    local = shapes[0] + np.tensordot(weights, shapes[1:], axes=1)
+    moved = np.einsum("fij,fvj->fvi", world[:, :3, :3], local) + world[:, None, :3, 3]
+    return moved, place[faces]

@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.registry import find_reader
 
+# Of a mesh on the host, for signatures.
+Positions = Float[np.ndarray, "vertices 3"]  # [m]
+Faces = Int[np.ndarray, "faces 3"]
 _FOLDED = -1e-6  # share of a polygon's squared area below which a triangle looks the other way
 _SLIVER = 1e-4  # share of the squared sum of its edges' squares below which a polygon has no area
 
@@ -74,12 +77,8 @@ def cut_polygons(
     if both will do, other polygons from their first such corner. So is a polygon with next to no area, in which
     rounding decides where triangles look.
 
-    Args:
-        points: Vertices [vertices, 3].
-        sizes: Number of corners of each polygon, three or more.
-        corners: Vertex of each corner, polygon after polygon.
-        starts: Corner from which each polygon was cut in another shape of the mesh; another number of them is
-            left out.
+    Polygons have three or more corners each, `sizes`, whose vertices follow each other in `corners`. `starts` are
+    the corners from which they were cut in another shape of the mesh; another number of them is left out.
 
     Returns:
         Triangles as places among the corners [triangles, 3]; the polygon of each triangle; and the corner from
@@ -122,6 +121,21 @@ def _fan_starts(polygons: np.ndarray) -> np.ndarray:
         is_folded = heights.min(axis=1) < _FOLDED * np.einsum("px,px->p", area, area)
         starts = np.where((starts < 0) & ~is_folded, start, starts)
     return starts
+
+
+def join_meshes(
+    positions: Sequence[np.ndarray], faces: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of several meshes as those of one."""
+    starts = np.cumsum([0, *map(len, positions)])[:-1]
+    moved = [own + start for own, start in zip(faces, starts, strict=True)]
+    return np.concatenate(positions), np.concatenate(moved)
+
+
+def stack_tables(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Return tables below each other; those with fewer columns get columns of zeros."""
+    width = max(table.shape[1] for table in tables)
+    return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])
 
 
 def name_parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:

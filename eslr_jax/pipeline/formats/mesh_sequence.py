@@ -105,18 +105,16 @@ def _read_folder(folder: Path, fps: float) -> MeshSequence:
         raise AssetError(f"folder {folder} holds both {' and '.join(known)} files; keep one kind")
     if len(files) > MAX_FRAMES:
         raise AssetError(f"folder {folder} holds {len(files)} files; {MAX_FRAMES} at most are read")
-    frames, faces, first = [], np.empty((0, 3), np.int64), None
+    frames, first = [], None
     for file in files:
         mesh = read_mesh_file(file, like=first)
-        points, triangles = mesh.positions, mesh.faces
-        if first is None:
-            first, faces = mesh, triangles
-        elif points.shape != frames[0].shape or not np.array_equal(triangles, faces):
+        points, first = mesh.positions, first or mesh
+        if points.shape != first.positions.shape or not np.array_equal(mesh.faces, first.faces):
             raise MeshError(
-                f"{file} has {len(points)} vertices and {len(triangles)} faces that differ from those of "
+                f"{file} has {len(points)} vertices and {len(mesh.faces)} faces that differ from those of "
                 f"{files[0].name}; a sequence keeps its topology"
             )
         frames.append(points)
         if len(frames) * len(points) > MAX_POINTS:
             raise AssetError(f"folder {folder} holds more than {MAX_POINTS} points; reduce the mesh")
-    return MeshSequence(folder.name, np.stack(frames), faces, fps)
+    return MeshSequence(folder.name, np.stack(frames), mesh.faces, fps)

@@ -177,10 +177,21 @@ def _curve(start: np.ndarray, end: np.ndarray, given: Any, unit: float, where: s
         given = {"type": "quadratic", "params": [given]}
     kind, params = _part(given, "type", str, where), _part(given, "params", list, where)
     along = end - start
-    across = np.array([-along[1], along[0]])
+    across = np.array([-along[1], along[0]])  # leaves the edge to the left
     if kind == "circle":
         radius, is_large, is_right = _numbers(params, (3,), f"{where}: params of its arc")
-        return _arc(start, along, across, unit * radius, is_large > 0, is_right > 0, where)
+        radius, half = unit * radius, 0.5 * float(np.linalg.norm(along))
+        if radius < half * (1 - _CHORD):
+            raise MeshError(
+                f"{where}: an arc of radius {radius:.3g} m can't span {2 * half:.3g} m; correct the radius"
+            )
+        rise = np.sqrt(max(radius**2 - half**2, 0.0)) / (2 * half)
+        center = start + 0.5 * along + (rise if (is_right > 0) != (is_large > 0) else -rise) * across
+        turn = 2 * np.arcsin(min(half / radius, 1.0))
+        turn = (2 * np.pi - turn if is_large > 0 else turn) * (1 if is_right > 0 else -1)
+        angle = np.linspace(0.0, turn, _CURVE_POINTS)[:, None]
+        spoke = start - center
+        return center + np.cos(angle) * spoke + np.sin(angle) * np.array([-spoke[1], spoke[0]])
     count = {"quadratic": 1, "cubic": 2}.get(kind)
     if count is None:
         raise MeshError(f"{where} has the curvature {kind!r}; give quadratic, cubic or circle")
@@ -190,30 +201,6 @@ def _curve(start: np.ndarray, end: np.ndarray, given: Any, unit: float, where: s
     while len(points) > 1:  # de Casteljau
         points = [(1 - t) * a + t * b for a, b in itertools.pairwise(points)]
     return points[0]
-
-
-def _arc(
-    start: np.ndarray,
-    along: np.ndarray,
-    across: np.ndarray,
-    radius: float,
-    is_large: bool,
-    is_right: bool,
-    where: str,
-) -> np.ndarray:
-    """Return an arc; it lies to the right or left of its chord, which the vector `across` leaves to the left."""
-    half = 0.5 * float(np.linalg.norm(along))
-    if radius < half * (1 - _CHORD):
-        raise MeshError(
-            f"{where}: an arc of radius {radius:.3g} m can't span {2 * half:.3g} m; correct the radius"
-        )
-    rise = np.sqrt(max(radius**2 - half**2, 0.0)) / (2 * half)
-    center = start + 0.5 * along + (rise if is_right != is_large else -rise) * across
-    turn = 2 * np.arcsin(min(half / radius, 1.0))
-    turn = (2 * np.pi - turn if is_large else turn) * (1 if is_right else -1)
-    angle = np.linspace(0.0, turn, _CURVE_POINTS)[:, None]
-    spoke = start - center
-    return center + np.cos(angle) * spoke + np.sin(angle) * np.array([-spoke[1], spoke[0]])
 
 
 def _crossing_segments(outline: np.ndarray) -> tuple[int, int] | None:
@@ -237,11 +224,7 @@ def _read_seams(given: Sequence[Any], panels: Mapping[str, Panel], name: str) ->
     seams, sewn = [], {}
     for number, stitch in enumerate(given):
         where = f"{name}: stitch {number}"
-        if (
-            not isinstance(stitch, list)
-            or len(stitch) not in (2, 3)
-            or stitch[2:] not in ([], ["right_wrong"])
-        ):
+        if not isinstance(stitch, list) or len(stitch) < 2 or stitch[2:] not in ([], ["right_wrong"]):
             raise MeshError(f"{where} is not two edges; give a panel and an edge for each")
         sides = tuple(_read_side(side, panels, where) for side in stitch[:2])
         seam = Seam((sides[0], sides[1]), len(stitch) == 3)

@@ -213,14 +213,9 @@ def read_smpl_pickle(path: Path, _clip: str = "") -> SkeletonMotion:
 def _parameters(path: Path, poses: Any, moves: Any, fps: float, up: str) -> SkeletonMotion:
     """Return the motion of rotations [frames, 3 joints] [rad] and root translations [m]; `up` is usual."""
     poses, moves = np.asarray(poses), np.asarray(moves)
-    is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu"
-    if (
-        not is_table
-        or not len(poses)
-        or moves.shape != (len(poses), 3)
-        or poses.shape[1] // 3 not in JOINT_NAMES
-        or poses.shape[1] % 3
-    ):
+    is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu" and len(poses) > 0
+    joints, rest = divmod(poses.shape[1], 3) if is_table else (0, 0)
+    if joints not in JOINT_NAMES or rest or moves.shape != (len(poses), 3):
         raise MotionError(
             f"motion file {path}: rotations {poses.shape} and translations {moves.shape}; expected [frames, 3 "
             f"times {', '.join(map(str, JOINT_NAMES))} joints] and [frames, 3]"
@@ -228,7 +223,7 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, up: str) -> Skel
     is_finite = np.isfinite(poses).all(axis=1) & np.isfinite(moves).all(axis=1)
     if not is_finite.all():
         raise MotionError(f"motion file {path}: frame {np.argmin(is_finite)} is not finite; cut or repair it")
-    skeleton = _standing_skeleton(poses.shape[1] // 3)
+    skeleton = _standing_skeleton(joints)
     rotations = chain_rotations(rotation_matrices(poses.reshape(len(poses), -1, 3)), skeleton.parents)
     positions = chain_positions(rotations, moves.astype(np.float64), skeleton)
     return SkeletonMotion(path.stem, skeleton, rotations, positions, fps, usual_up=up)

@@ -19,17 +19,9 @@ from eslr_jax.errors import AssetError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.pickle import make_stub, unpickle
 
-_STORAGES = {
-    "FloatStorage": "f4",
-    "DoubleStorage": "f8",
-    "HalfStorage": "f2",
-    "LongStorage": "i8",
-    "IntStorage": "i4",
-    "ShortStorage": "i2",
-    "CharStorage": "i1",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
-}
+_FLOATS = {"FloatStorage": "f4", "DoubleStorage": "f8", "HalfStorage": "f2"}
+_INTEGERS = {"LongStorage": "i8", "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1"}
+_STORAGES = {**_FLOATS, **_INTEGERS, "ByteStorage": "u1", "BoolStorage": "?"}
 
 
 def read_torch(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> Any:

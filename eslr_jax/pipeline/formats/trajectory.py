@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.files.npz import check_layout, read_arrays, write_arrays
-from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
+from eslr_jax.pipeline.formats.animated import MESH_LAYOUT, AnimatedMesh, Skin
 from eslr_jax.pipeline.formats.palette import SKIN_COLOR
 
 FORMAT = "eslr-trajectory-3"
@@ -30,20 +31,14 @@ _BODY = {name: f"body_{name}" for name in ("positions", "faces", "rest_positions
 _SKIN = {field.name: f"body_{field.name}" for field in dataclasses.fields(Skin)}
 _LAYOUT = {
     "timestep": ("f", ""),
-    "positions": ("f", "frames vertices 3"),
-    "velocities": ("f", "frames vertices 3"),
-    "faces": ("iu", "faces 3", "vertices"),
+    **{name: MESH_LAYOUT[name] for name in ("positions", "velocities", "faces")},
     "friction_loads": ("f", "frames vertices"),
     "residuals": ("f", "frames"),
-    "body_positions": ("f", "frames body_vertices 3"),
-    "body_faces": ("iu", "body_faces 3", "body_vertices"),
-    "body_rest_positions": ("f", "body_vertices 3"),
-    "body_joint_transforms": ("f", "frames joints 3 4"),
-    "body_joint_rest_positions": ("f", "joints 3"),
-    "body_parents": ("iu", "joints"),
-    "body_joint_names": ("U", "joints"),
-    "body_skin_weights": ("f", "body_vertices influences"),
-    "body_skin_indices": ("iu", "body_vertices influences", "joints"),
+}
+_LAYOUT |= {  # the body has other vertices and faces
+    f"body_{name}": tuple(re.sub("vertices|faces", r"body_\g<0>", words) for words in layout)
+    for name, layout in MESH_LAYOUT.items()
+    if name in (*_BODY, *_SKIN)
 }
 _REMEDY = "write it again"
 
@@ -100,7 +95,6 @@ def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
 
 
 def _stored(name: str, array: np.ndarray) -> np.ndarray:
-    """Return an array in the type that it is stored in."""
     if name == "timestep" or array.dtype.kind not in "fiu":
         return array
     return array.astype(np.int32 if "i" in _LAYOUT.get(name, "f")[0] else np.float32)
@@ -129,20 +123,11 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
     if "body_positions" in arrays:
         values = {field: arrays[name] for field, name in _BODY.items()}
         body = AnimatedMesh("body", **values, color=SKIN_COLOR, skin=skin)
-    return TrajectoryFile(
-        arrays["positions"],
-        arrays["velocities"],
-        arrays["faces"],
-        float(arrays["timestep"]),
-        metadata,
-        body,
-        arrays.get("friction_loads"),
-        arrays.get("residuals"),
-    )
+    track = (arrays["positions"], arrays["velocities"], arrays["faces"], float(arrays["timestep"]))
+    return TrajectoryFile(*track, metadata, body, arrays.get("friction_loads"), arrays.get("residuals"))
 
 
 def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Raise AssetError unless the arrays form a trajectory."""
     missing = [name for name in _REQUIRED if name not in arrays]
     if missing:
         raise AssetError(

@@ -15,15 +15,7 @@ import numpy as np
 from eslr_jax.errors import AssetError
 from eslr_jax.files.atomic import atomic_write
 from eslr_jax.pipeline.extras import require
-from eslr_jax.pipeline.formats.animated import (
-    AnimatedMesh,
-    Skin,
-    corrections,
-    identifiers,
-    influences,
-    local_motion,
-    vertex_normals,
-)
+from eslr_jax.pipeline.formats import animated
 from eslr_jax.pipeline.formats.palette import Color, srgb_to_linear
 from eslr_jax.pipeline.formats.registry import writer
 from eslr_jax.pose.skeleton import whole_rate
@@ -33,7 +25,7 @@ TOLERANCE = 1e-4  # [m] by which joints may miss a vertex
 
 
 @writer("scene", SUFFIXES)
-def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
+def write_usd(path: str | Path, meshes: Sequence[animated.AnimatedMesh], timestep: float) -> None:
     """Write meshes as a USD stage, one whole time code per frame, atomically; `.usda` is text.
 
     Vertices keep their order; texture coordinates are the face-varying primvar `st`. Metres, Y up. A rate that
@@ -58,19 +50,19 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
         stage.SetEndTimeCode(len(meshes[0].positions) - 1)
         world = UsdGeom.Xform.Define(stage, "/World")
         stage.SetDefaultPrim(world.GetPrim())
-        names = identifiers([mesh.name for mesh in meshes])
+        names = animated.identifiers([mesh.name for mesh in meshes])
         for name, mesh in zip(names, meshes, strict=True):
             _add_mesh(stage, f"/World/{name}", mesh)
         stage.GetRootLayer().Save()
         del stage, world  # the layer keeps the file open
 
 
-def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
+def _add_mesh(stage: Any, path: str, mesh: animated.AnimatedMesh) -> None:
     """Add a mesh: bound to a skeleton where that moves it exactly, as points otherwise."""
-    from pxr import Sdf, UsdGeom, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
+    from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
 
-    positions, rest, skin = np.asarray(mesh.positions, np.float32), mesh.rest_positions, mesh.skin
-    if skin is not None and rest is not None and corrections(skin, rest, positions, TOLERANCE) is not None:
+    skin = mesh.skin
+    if skin is not None and animated.corrections(mesh, skin, TOLERANCE) is not None:
         skin = None  # joints alone don't do
     if skin is not None:
         UsdSkel.Root.Define(stage, path)
@@ -92,35 +84,23 @@ def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
         primvar = UsdGeom.PrimvarsAPI(prim.GetPrim()).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
         primvar.Set(Vt.Vec2fArray.FromNumpy(uvs))
     _add_material(stage, f"{path}_material", mesh.color, prim)
-    if skin is not None:
-        _set_points(prim, np.asarray(rest, np.float32), faces)
-        _bind(stage, path, prim, skin)
-        return
-    for frame, points in enumerate(positions):
-        velocities = None if mesh.velocities is None else mesh.velocities[frame]
-        _set_points(prim, points, faces, velocities, frame)
-
-
-def _set_points(
-    prim: Any,
-    points: np.ndarray,
-    faces: np.ndarray,
-    velocities: np.ndarray | None = None,
-    frame: int | None = None,
-) -> None:
-    """Set points [m], normals, velocities [m/s] and bounds of a frame, or of all time."""
-    from pxr import Usd, Vt  # pyright: ignore[reportMissingImports]
-
-    time = Usd.TimeCode.Default() if frame is None else Usd.TimeCode(frame)
 
     def vectors(values: np.ndarray) -> Any:
         return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
-    prim.CreatePointsAttr().Set(vectors(points), time)
-    prim.CreateNormalsAttr().Set(vectors(vertex_normals(points, faces)), time)
-    prim.CreateExtentAttr().Set(vectors(np.stack([points.min(axis=0), points.max(axis=0)])), time)
-    if velocities is not None:
-        prim.CreateVelocitiesAttr().Set(vectors(velocities), time)
+    def set_points(points: np.ndarray, time: Any) -> None:
+        prim.CreatePointsAttr().Set(vectors(points), time)
+        prim.CreateNormalsAttr().Set(vectors(animated.vertex_normals(points, faces)), time)
+        prim.CreateExtentAttr().Set(vectors(np.stack([points.min(axis=0), points.max(axis=0)])), time)
+
+    if skin is not None:
+        set_points(np.asarray(mesh.rest_positions, np.float32), Usd.TimeCode.Default())
+        _bind(stage, path, prim, skin)
+        return
+    for frame, points in enumerate(np.asarray(mesh.positions, np.float32)):
+        set_points(points, Usd.TimeCode(frame))
+        if mesh.velocities is not None:
+            prim.CreateVelocitiesAttr().Set(vectors(mesh.velocities[frame]), frame)
 
 
 def _add_material(stage: Any, path: str, color: Color, prim: Any) -> None:
@@ -141,12 +121,12 @@ def _add_material(stage: Any, path: str, color: Color, prim: Any) -> None:
     UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
 
 
-def _bind(stage: Any, path: str, prim: Any, skin: Skin) -> None:
+def _bind(stage: Any, path: str, prim: Any, skin: animated.Skin) -> None:
     """Add a skeleton with its animation below a SkelRoot, and bind a mesh to it."""
     from pxr import Gf, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
 
     joints: list[str] = []  # paths: parent/child
-    for name, parent in zip(identifiers(skin.joint_names), skin.parents, strict=True):
+    for name, parent in zip(animated.identifiers(skin.joint_names), skin.parents, strict=True):
         joints.append(name if parent < 0 else f"{joints[parent]}/{name}")
     rest = np.asarray(skin.joint_rest_positions, np.float64)
     above = np.array([rest[parent] if parent >= 0 else np.zeros(3) for parent in skin.parents])
@@ -163,12 +143,12 @@ def _bind(stage: Any, path: str, prim: Any, skin: Skin) -> None:
     animation.CreateJointsAttr(joints)
     animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(1.0)] * len(joints)))
     turned, moved = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
-    rotations, translations = local_motion(skin)
+    rotations, translations = animated.local_motion(skin)
     for frame, (quaternions, shifts) in enumerate(zip(rotations, translations, strict=True)):
         values = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in quaternions]
         turned.Set(Vt.QuatfArray(values), frame)
         moved.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(shifts)), frame)
-    weights, indices = influences(skin)
+    weights, indices = animated.influences(skin)
     binding = UsdSkel.BindingAPI.Apply(prim.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     binding.CreateJointIndicesPrimvar(False, weights.shape[1]).Set(

@@ -266,7 +266,6 @@ def _busy(live: Live, text: str) -> Iterator[None]:
 
 
 def _load(live: Live, choice: Choice) -> None:
-    """Put what is chosen on stage."""
     live.refused = choice  # until it is there
     with _busy(live, f"preparing {' and '.join(choice.garments)} on {choice.motion}"):
         rig = load_body(choice.body, betas=choice.betas)
@@ -380,13 +379,10 @@ def _save(live: Live) -> None:
     poses = cast.poses.replace(
         positions=cast.poses.positions[frames], joint_transforms=cast.poses.joint_transforms[frames]
     )
-    track = ClothTrack(
-        *(
-            np.stack([getattr(one.state, name) for one in recorded])
-            for name in ("position", "velocity", "friction_load")
-        ),
-        residuals=np.stack([one.residual for one in recorded]),
+    states, residuals = jax.tree.map(
+        lambda *leaves: np.stack(leaves), *((one.state, one.residual) for one in recorded)
     )
+    track = ClothTrack(states.position, states.velocity, states.friction_load, residuals)
     constant = changed(cast.stage, fabric, wind, no_hand()).constant
     tracks = slice_tracks(cast.stage.scene, jnp.asarray(frames))
     scene = constant.replace(

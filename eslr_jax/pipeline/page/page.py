@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import threading
 import time
 from collections.abc import Sequence
@@ -79,8 +80,7 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
     gui = server.gui
     uplot = require("viser.uplot", extra="view")
     series = [uplot.Series(label="s")]
-    for number, run in enumerate(runs):
-        color = _CURVE_COLORS[number % len(_CURVE_COLORS)]
+    for run, color in zip(runs, itertools.cycle(_CURVE_COLORS), strict=False):
         series.append(uplot.Series(label=run.name, stroke=color, width=2))
     time = np.arange(num_frames) * runs[0].trajectory.timestep
     controls = {
@@ -181,16 +181,15 @@ def _show_run(view: View, k: int, frame: int, colors: np.ndarray | None) -> None
     scene.add_label(f"/runs/{k}/name", run.name, position=tuple(top))
     points = (trajectory.positions[frame] + offset).astype(np.float32)
     name, garments = f"/runs/{k}/garment", view.garments[k]
+
+    def draw(name: str, piece: Piece, whole: np.ndarray, **options: Any) -> None:
+        color = byte_color(piece.color)
+        scene.add_mesh_simple(name, piece.place(whole), piece.faces, color=color, **options)
+
     if colors is None or wireframe:
         for number, piece in enumerate(garments):
-            scene.add_mesh_simple(
-                name if number == 0 else f"{name}_{number}",
-                piece.place(points),
-                piece.faces,
-                color=byte_color(piece.color),
-                wireframe=wireframe,
-                side="double",
-            )
+            own = name if number == 0 else f"{name}_{number}"
+            draw(own, piece, points, wireframe=wireframe, side="double")
     else:
         for number in range(1, len(garments)):
             scene.remove_by_name(f"{name}_{number}")
@@ -200,13 +199,9 @@ def _show_run(view: View, k: int, frame: int, colors: np.ndarray | None) -> None
         scene.add_mesh_trimesh(name, mesh)
     if trajectory.body is not None:
         for number, piece in enumerate(view.bodies[k]):
-            scene.add_mesh_simple(
-                f"/runs/{k}/body" if number == 0 else f"/runs/{k}/body_{piece.name}",
-                piece.place(trajectory.body.positions[frame] + offset),
-                piece.faces,
-                color=byte_color(piece.color),
-                visible=bool(view.controls["body"].value),
-            )
+            name = f"/runs/{k}/body" if number == 0 else f"/runs/{k}/body_{piece.name}"
+            is_shown = bool(view.controls["body"].value)
+            draw(name, piece, trajectory.body.positions[frame] + offset, visible=is_shown)
 
 
 def _fields(view: View, name: str) -> tuple[list[Field], str]:
@@ -241,7 +236,6 @@ def _curves(view: View, name: str) -> Float[np.ndarray, "runs frames"] | None:
 
 
 def _change_color(view: View) -> None:
-    """Show another field, and its plot."""
     curves, plot = _curves(view, view.controls["color"].value), view.controls["plot"]
     plot.visible = view.controls["worst"].visible = curves is not None
     if curves is not None:

@@ -85,13 +85,9 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
 
 
 def _staged(scene: Scene, material: Material) -> Stage:
-    """Return the stage of a scene."""
-    inputs = frame_inputs(scene)
-    back = (
-        inputs
-        if inputs.body is None
-        else inputs._replace(body=inputs.body._replace(start=inputs.body.end, end=inputs.body.start))
-    )
+    back = inputs = frame_inputs(scene)
+    if (body := inputs.body) is not None:
+        back = back._replace(body=body._replace(start=body.end, end=body.start))
     if scene.pin_targets is not None:
         back = back._replace(pin_targets=scene.pin_targets[:-1])
     constant = jax.tree.map(jnp.asarray, without_tracks(scene)).replace(num_frames=2)

@@ -12,8 +12,7 @@ from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.formats.animated import Skin, check_moving
 from eslr_jax.pipeline.formats.palette import GARMENT_COLORS
 from eslr_jax.pipeline.pictures.annotate import side_by_side
-from eslr_jax.pipeline.pictures.camera import facing_angles, follow, parse_angle
-from eslr_jax.pipeline.pictures.scene import Surface, trace_picture
+from eslr_jax.pipeline.pictures.scene import Surface, facing_angles, follow, parse_angle, trace_picture
 from eslr_jax.pipeline.rigs.clothing import body_pieces
 from eslr_jax.types import Body
 
@@ -115,23 +114,15 @@ def render_frame(
     body_faces: np.ndarray | None,
     garment_positions: np.ndarray,
     garment_faces: np.ndarray,
-    *,
-    vertex_colors: np.ndarray | None = None,
     **options: Any,
 ) -> np.ndarray:
     """Render one picture, [height, width, 3].
 
     Arguments and errors are those of `render_frames`; positions and colours have no axis of frames.
     """
-    frames = render_frames(
-        None if body_positions is None else np.asarray(body_positions)[None],
-        body_faces,
-        np.asarray(garment_positions)[None],
-        garment_faces,
-        vertex_colors=vertex_colors,
-        **options,
-    )
-    return next(frames)
+    body = None if body_positions is None else np.asarray(body_positions)[None]
+    cloth = np.asarray(garment_positions)[None]
+    return next(render_frames(body, body_faces, cloth, garment_faces, **options))
 
 
 def contact_sheet(
@@ -165,17 +156,9 @@ def contact_sheet(
         )
     last = len(garment_positions) - 1
     indices = sorted({round(frame) for frame in np.linspace(0, last, num_frames)})
-    frames = render_frames(
-        body_positions,
-        body_faces,
-        garment_positions,
-        garment_faces,
-        frame_indices=indices,
-        size=size,
-        **options,
-    )
+    meshes = (body_positions, body_faces, garment_positions, garment_faces)
     pictures = []
-    for picture in frames:
+    for picture in render_frames(*meshes, frame_indices=indices, size=size, **options):
         pictures.append(picture)
         if on_picture is not None:
             on_picture(len(pictures), len(indices))

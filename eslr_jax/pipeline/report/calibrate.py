@@ -51,10 +51,7 @@ def read_coarse_edges(names: tuple[str, ...]) -> bool:
 
 
 def measure_costs(names: tuple[str, ...], scene: Scene) -> list[Cost]:
-    """Time the first frames of a scene by the solver (SOLVER) or networks, in turns.
-
-    A machine's speed changes within minutes.
-    """
+    """Time the first frames of a scene by the solver (SOLVER) or networks, in turns: machine speeds change."""
     runs = {(name, count): (*simulator_of(name), count) for name in names for count in _TIMED_ITERATIONS}
     fixed_ms, iteration_ms = fit_costs(time_frames(runs, scene))
     num_vertices = int(np.sum(scene.garment.vertex_mask))

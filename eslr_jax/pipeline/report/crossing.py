@@ -14,6 +14,7 @@ from eslr_jax.mesh.closest import closest_points
 from eslr_jax.mesh.piercing import piercing_edges
 from eslr_jax.mesh.topology import undirected_edges, unique_edges, vertex_components
 from eslr_jax.pipeline.extras import require
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 
 
 class Crossings(NamedTuple):
@@ -23,9 +24,7 @@ class Crossings(NamedTuple):
     depths: Float[np.ndarray, " vertices"]  # behind the other layer [m]; zero elsewhere
 
 
-def find_crossings(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Crossings:
+def find_crossings(positions: Positions, faces: Faces) -> Crossings:
     """Return the pairs of faces that intersect, and how deep vertices are behind the layer that they passed.
 
     Two faces intersect where an edge of one pierces the other; faces that share a vertex touch and don't count.
@@ -54,9 +53,7 @@ def find_crossings(
     return Crossings(pairs, depths)
 
 
-def _regions(
-    piercing: Int[np.ndarray, "edges 2"], faces: Int[np.ndarray, "faces 3"], num_vertices: int
-) -> Int[np.ndarray, " vertices"]:
+def _regions(piercing: np.ndarray, faces: Faces, num_vertices: int) -> Int[np.ndarray, " vertices"]:
     """Return numbers of the regions that piercing edges cut off; zero for the largest part of every piece."""
     edges = unique_edges(faces)
     keys = edges.min(axis=1) * num_vertices + edges.max(axis=1)
@@ -76,10 +73,7 @@ def _regions(
 
 
 def intersecting_pairs(
-    cloth: Float[np.ndarray, "vertices 3"],
-    cloth_faces: Int[np.ndarray, "faces 3"],
-    body: Float[np.ndarray, "body_vertices 3"] | None = None,
-    body_faces: Int[np.ndarray, "body_faces 3"] | None = None,
+    cloth: Positions, cloth_faces: Faces, body: Positions | None = None, body_faces: Faces | None = None
 ) -> Int[np.ndarray, "pairs 2"]:
     """Return pairs of intersecting faces; the numbers of body faces follow those of cloth faces.
 

@@ -176,23 +176,22 @@ def _drift(network: Network, scene: Scene, config: SimConfig) -> float | None:
 
 def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
     """Return means, and the worst where a bar is on the worst; `optimum` holds the same of the solver."""
+
+    def all_of(name: str) -> list[Any]:
+        return [scene[name] for scene in scenes]
+
+    terms = all_of("terms")
     pooled = {
-        "finite": all(scene["finite"] for scene in scenes),
-        "stretch_p99": float(np.max([scene["stretch_p99"] for scene in scenes])),
-        "penetration_p999_mm": float(np.max([scene["penetration_p999_mm"] for scene in scenes])),
-        **{
-            name: float(np.mean([scene[name] for scene in scenes]))
-            for name in ("total", "jitter_m_s3", "coverage")
-        },
-        "terms": {
-            name: float(np.mean([scene["terms"][name] for scene in scenes])) for name in scenes[0]["terms"]
-        },
+        "finite": all(all_of("finite")),
+        **{name: float(np.max(all_of(name))) for name in ("stretch_p99", "penetration_p999_mm")},
+        **{name: float(np.mean(all_of(name))) for name in ("total", "jitter_m_s3", "coverage")},
+        "terms": {name: float(np.mean([one[name] for one in terms])) for name in terms[0]},
     }
     if "optimum" in scenes[0]:
+        best = _pool_rollouts(all_of("optimum"))
         ratios = [scene["coverage"] / max(scene["optimum"]["coverage"], 1e-9) for scene in scenes]
         pooled["coverage_worst_ratio"] = float(np.min(ratios))
-        pooled["distance_mm"] = float(np.mean([scene["distance_mm"] for scene in scenes]))
-        pooled["optimum"] = _pool_rollouts([scene["optimum"] for scene in scenes])
+        pooled |= {"distance_mm": float(np.mean(all_of("distance_mm"))), "optimum": best}
     return pooled
 
 

@@ -12,18 +12,17 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from eslr_jax.errors import AssetError
-from eslr_jax.mesh.topology import vertex_normals
-from eslr_jax.numerics import components, product, scatter_corners
-from eslr_jax.pipeline.report.gap import map_frames, trajectory_states
+from eslr_jax.mesh.topology import vertex_areas, vertex_normals
+from eslr_jax.numerics import components, product
+from eslr_jax.pipeline.report.gap import map_frames
+from eslr_jax.pipeline.report.metrics import face_stretches
 from eslr_jax.pipeline.report.run import Run, run_trajectory
-from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential
 from eslr_jax.solver.solve import Start, solve
 from eslr_jax.terms.problem import FrameProblem, pin
-from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.terms.term import vertex_shares
-from eslr_jax.types import ClothState, Garment, Scene
+from eslr_jax.types import Scene, Trajectory
 
 # Energy lost to air and damping belongs to a frame, not to a shape.
 _TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction")
@@ -46,7 +45,7 @@ class Field(NamedTuple):
 def run_field(run: Run, name: str) -> Field:
     """Return a field of a run.
 
-    `stretch` is the largest principal stretch, averaged over the faces around a vertex; energies and `gap`
+    `stretch` is the largest principal stretch, averaged over the area of faces around a vertex; energies, `gap`
     are those of the frame's minimisation problem, per area, see `energy_shares` and `gap_shares`; `distance`
     is to the tangent plane of the nearest body vertex.
 
@@ -70,11 +69,13 @@ def run_field(run: Run, name: str) -> Field:
         return Field(values, 0.0, 0.06, "m")
     garment = run.scene.garment
     if name == "stretch":
-        values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
+        stretches = np.asarray(face_stretches(jnp.asarray(run.trajectory.positions), garment))
+        areas, faces = np.asarray(garment.rest_areas, np.float64), np.asarray(garment.faces)
+        count = len(garment.rest_positions)
+        values = np.stack([vertex_areas(areas * row, faces, count) for row in stretches])
+        values /= np.maximum(vertex_areas(areas, faces, count), 1e-12)
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
-    trajectory = run_trajectory(run)
-    states, _ = trajectory_states(trajectory, run.scene)
-    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
+    values = np.asarray(_every_frame(name, run_trajectory(run), run.scene))
     values = np.concatenate([np.zeros_like(values[:1]), values])
     values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
     # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
@@ -84,33 +85,11 @@ def run_field(run: Run, name: str) -> Field:
     return Field(values, min(float(low), 0.0), max(float(high), 1e-6), "J/m2")
 
 
-@jax.jit
-def _stretches(
-    positions: Float[Array, "frames vertices 3"], garment: Garment
-) -> Float[Array, "frames vertices"]:
-    """Return the mean over a vertex' faces of their larger principal stretch, weighted by area."""
-
-    def frame(position: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
-        larger, _ = principal_stretches(position, garment)
-        weights = garment.rest_areas[:, None] * jnp.ones((1, 3))
-        total = scatter_corners(weights, garment.face_incidence)
-        return scatter_corners(weights * larger[:, None], garment.face_incidence) / jnp.maximum(total, 1e-12)
-
-    return jax.lax.map(frame, positions)
-
-
 @partial(jax.jit, static_argnames="name")
-def _every_frame(
-    name: str, reached: Float[Array, "frames vertices 3"], states: ClothState, scene: Scene
-) -> Float[Array, "frames vertices"]:
+def _every_frame(name: str, trajectory: Trajectory, scene: Scene) -> Float[Array, "frames vertices"]:
     """State the problem of every frame and return a value of where the cloth went [J]."""
-
-    def measure(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
-        if name == "gap":
-            return gap_shares(position, problem)
-        return energy_shares(name.removesuffix("-energy"), position, problem)
-
-    return map_frames(measure, reached, states, frame_inputs(scene), scene)
+    measure = gap_shares if name == "gap" else partial(energy_shares, name.removesuffix("-energy"))
+    return map_frames(measure, trajectory, scene)
 
 
 def energy_shares(

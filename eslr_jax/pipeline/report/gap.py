@@ -186,27 +186,17 @@ def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> Optim
 
 
 def map_frames(
-    measure: Callable[[Float[Array, "vertices 3"], FrameProblem], Any],
-    reached: Float[Array, "frames vertices 3"],
-    states: ClothState,
-    inputs: FrameInput,
-    scene: Scene,
+    measure: Callable[[Float[Array, "vertices 3"], FrameProblem], Any], trajectory: Trajectory, scene: Scene
 ) -> Any:
-    """Apply `measure` to the positions that the cloth reached in every frame, and to the frame's problem.
-
-    `reached` are anybody's positions at t + 1 [m]; states and inputs, at t, are those of `trajectory_states`.
-    """
-
-    def frame(arguments):
-        position, state, inputs = arguments
-        return measure(position, frame_problem(scene, state, inputs))
-
-    return jax.lax.map(frame, (reached, states, inputs))
+    """Apply `measure` to where the cloth went in every simulated frame [m], and to the frame's problem."""
+    frames = (trajectory.positions[1:], *trajectory_states(trajectory, scene))
+    return jax.lax.map(lambda frame: measure(frame[0], frame_problem(scene, *frame[1:])), frames)
 
 
 @jax.jit
 def reached_potentials(
     reached: Float[Array, "frames vertices 3"], states: ClothState, inputs: FrameInput, scene: Scene
 ) -> Float[Array, " frames"]:
-    """Return the potential [J] of positions from the states beside them; the arguments are `map_frames`'s."""
-    return map_frames(potential, reached, states, inputs, scene)
+    """Return the potential [J] of anybody's positions at t + 1 [m], from states at t of `trajectory_states`."""
+    frames = (reached, states, inputs)
+    return jax.lax.map(lambda frame: potential(frame[0], frame_problem(scene, *frame[1:])), frames)

@@ -66,7 +66,7 @@ def trajectory_report(
     measures = jax.device_get(measure_frames(trajectory.positions, scene))
     trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
     is_real = np.asarray(scene.garment.vertex_mask)
-    positions = np.asarray(trajectory.positions)[:, is_real]
+    positions = trajectory.positions[:, is_real]
 
     def stretches(frame: int) -> np.ndarray:
         return np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
@@ -145,7 +145,6 @@ def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, 
 
 
 def _real_faces(scene: Scene) -> np.ndarray:
-    """Return the faces of the garment that are no padding."""
     return np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
 
 

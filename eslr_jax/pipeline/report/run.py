@@ -94,14 +94,8 @@ def write_run(
     """
     rig, poses, stored = actor
     folder = ensure_output_dir(folder)
-    skin = Skin(
-        skin_weights=np.asarray(rig.skin_weights),
-        skin_indices=np.asarray(rig.skin_indices),
-        joint_transforms=np.asarray(poses.joint_transforms),
-        joint_rest_positions=np.asarray(rig.joint_rest_positions),
-        parents=rig.parents,
-        joint_names=rig.joint_names,
-    )
+    arrays = (rig.skin_weights, rig.skin_indices, poses.joint_transforms, rig.joint_rest_positions)
+    skin = Skin(*map(np.asarray, arrays), parents=rig.parents, joint_names=rig.joint_names)
     moving, faces, rest = map(np.asarray, (poses.positions, poses.faces, poses.rest_positions))
     body = AnimatedMesh("body", moving, faces, SKIN_COLOR, rest_positions=rest, skin=skin)
     file = TrajectoryFile(

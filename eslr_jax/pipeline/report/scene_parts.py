@@ -51,10 +51,8 @@ def describe_scene(scene: Scene, poses: BodyMotion, network: Network | None) -> 
     sort("body", faces > 0, f"{faces} of {total} faces", "out of reach")
     pinned = int(np.sum(scene.garment.is_pinned))
     sort("pins", scene.pin_targets is not None, f"{pinned} vertices", "none")
-    material = {
-        field.name: getattr(scene.material, field.name) for field in dataclasses.fields(scene.material)
-    }
-    varied = [name for name, part in material.items() if any(map(np.ndim, jax.tree.leaves(part)))]
+    material = vars(scene.material).items()
+    varied = [name for name, part in material if any(map(np.ndim, jax.tree.leaves(part)))]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")
     if scene.initial_state.past is not None:
         modelled["BDF2"] = "swinging cloth keeps its energy"
@@ -78,10 +76,7 @@ def time_parts(network: Network | None, scene: Scene, config: SimConfig) -> dict
             lambda guess: solve(problem, Start(*guess), iterations=_ITERATIONS).position,
             (guess,),
         ),
-        "whole frame": (
-            lambda state: step_frame(stepper, scene, state, inputs)[0],
-            (state,),
-        ),
+        "whole frame": (lambda state: step_frame(stepper, scene, state, inputs)[0], (state,)),
     }
     if scene.body is not None:
         parts["searches for contacts"] = (lambda state: frame_problem(scene, state, inputs), (state,))

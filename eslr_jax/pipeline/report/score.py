@@ -14,13 +14,7 @@ from eslr_jax.errors import ConfigError, MissingExtraError, MotionError, NonFini
 from eslr_jax.numerics import safe_norm
 from eslr_jax.pipeline.formats.garment import split_outfit
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
-from eslr_jax.pipeline.report.gap import (
-    gap_medians,
-    map_frames,
-    past_states,
-    trajectory_gap,
-    trajectory_states,
-)
+from eslr_jax.pipeline.report.gap import gap_medians, map_frames, past_states, trajectory_gap
 from eslr_jax.pipeline.report.metrics import face_stretches
 from eslr_jax.pipeline.report.report import Parts, trajectory_report
 from eslr_jax.pipeline.report.wear import wear_report
@@ -111,10 +105,9 @@ def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
         residual = safe_norm(gradient.reshape(-1)) / weight_norm(problem)
         return potential_terms(position, problem), residual, buffer_demands(problem)
 
-    states, inputs = trajectory_states(trajectory, scene)
-    measured = map_frames(measure, trajectory.positions[1:], states, inputs, scene)
     energies, residuals, demands = jax.tree.map(
-        lambda track: jnp.concatenate([jnp.zeros_like(track[:1]), track]), measured
+        lambda track: jnp.concatenate([jnp.zeros_like(track[:1]), track]),
+        map_frames(measure, trajectory, scene),
     )
     return trajectory.replace(energies=energies, residuals=residuals, demands=demands)
 

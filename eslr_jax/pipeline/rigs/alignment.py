@@ -26,9 +26,7 @@ _BEFORE = {
 Parts = Mapping[Part, list[int]]  # joints of each part of a rig
 
 
-def match_parts(
-    target: Skeleton, source: Skeleton, followed: list[int]
-) -> tuple[dict[Part, list[int]], dict[Part, list[int]]]:
+def match_parts(target: Skeleton, source: Skeleton, followed: list[int]) -> tuple[Parts, Parts]:
     """Return the joints of each part that both rigs have: those of the body, and those of the source.
 
     `followed` has the joint of the source that each joint of the body follows, or -1.
@@ -64,25 +62,13 @@ def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float 
 
 
 def align_rests(
-    target: Skeleton,
-    source: Skeleton,
-    ours: Parts,
-    theirs: Parts,
-    name: str,
-    motion: SkeletonMotion | None = None,
+    target: Skeleton, source: Skeleton, ours: Parts, theirs: Parts, motion: SkeletonMotion | None = None
 ) -> NDArray:
     """Return the rotation from the body's rest pose to the source's for each joint, shape [joints, 3, 3].
 
     A limb turns as little as lays the body's bone along the source's. If the source's legs do not stand at rest,
-    as when all bones lie along one axis, the frames of its motion decide; see `_turns_of_frames`.
-
-    Args:
-        target: Joints of the body.
-        source: Joints of the source.
-        ours: Joints of the body by part; see `match_parts`.
-        theirs: Joints of the source by part.
-        name: What messages call the source.
-        motion: Of the source, Y up; None if it does not move.
+    as when all bones lie along one axis, the frames of its motion, Y up, decide; see `_turns_of_frames`. `ours`
+    and `theirs` are the joints of each part; see `match_parts`.
 
     Raises:
         MotionError: The source's legs stand neither at rest nor in a frame.
@@ -90,17 +76,10 @@ def align_rests(
     upright = _torso_turn(target, ours, source, theirs)
     limbs = _find_limbs(target, source, ours, theirs)
     turns = {part: _smallest_turn(upright @ bone, end) @ upright for part, (bone, end) in limbs.items()}
-    lying = [
-        part
-        for part, (bone, end) in limbs.items()
-        if part[1] in _LEG and _angle_between(upright @ bone, end) > MAX_LEG_TURN
-    ]
-    if lying:
+    legs = [limb for part, limb in limbs.items() if part[1] in _LEG]
+    if any(_angle_between(upright @ bone, end) > MAX_LEG_TURN for bone, end in legs):
         if motion is None:
-            raise MotionError(
-                f"{name}: its rest pose does not stand ({' '.join(lying[0])} points elsewhere); "
-                "export it with a T-pose at rest"
-            )
+            raise MotionError("the rest pose of a skeleton does not stand; export it with a T-pose at rest")
         turns = _turns_of_frames(limbs, theirs, upright, motion)
     result = np.tile(upright, (len(target), 1, 1))
     continued = {"forearm": HAND, "foot": ("toe",)}
@@ -172,7 +151,6 @@ def _turns_of_frames(
 
 
 def _smallest_turn(start: NDArray, end: NDArray) -> NDArray:
-    """Return the smallest rotation of one direction to another, shape [3, 3]."""
     return Rotation.align_vectors(end[None], start[None])[0].as_matrix()
 
 

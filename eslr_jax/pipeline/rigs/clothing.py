@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from eslr_jax.mesh.skinning import smooth
 from eslr_jax.pipeline.formats.animated import Skin
 from eslr_jax.pipeline.formats.garment import split_outfit
+from eslr_jax.pipeline.formats.mesh import Faces, Positions
 from eslr_jax.pipeline.formats.palette import BODY_COLORS, Color, garment_color
 from eslr_jax.pose.joints import find_named_parts
 from eslr_jax.types import Body
@@ -33,17 +34,17 @@ class Piece(NamedTuple):
     """A mesh of one colour, a part of a body or of an outfit."""
 
     name: str
-    faces: Int[np.ndarray, "faces 3"]  # of its own vertices
+    faces: Faces  # of its own vertices
     weights: sparse.csr_array | slice  # its vertices from those of the whole
     color: Color
 
-    def place(self, positions: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "own_vertices 3"]:
+    def place(self, positions: Positions) -> Float[np.ndarray, "own_vertices 3"]:
         """Return where its vertices are [m], given those of the whole [m]."""
         positions = np.asarray(positions, np.float32)
         return positions[self.weights] if isinstance(self.weights, slice) else self.weights @ positions
 
 
-def garment_pieces(faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]) -> list[Piece]:
+def garment_pieces(faces: Faces, outfit: dict[str, int]) -> list[Piece]:
     """Return the garments of an outfit, given its names and numbers of vertices in order."""
     faces = np.asarray(faces)
     return [
@@ -52,11 +53,7 @@ def garment_pieces(faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]) ->
     ]
 
 
-def body_pieces(
-    rest_positions: Float[np.ndarray, "body_vertices 3"],
-    faces: Int[np.ndarray, "body_faces 3"],
-    rig: Body | Skin | None,
-) -> list[Piece]:
+def body_pieces(rest_positions: Positions, faces: Faces, rig: Body | Skin | None) -> list[Piece]:
     """Return skin, top and shorts of a body at rest, upright [m].
 
     All of it is skin without what moves it, and if its joints have no common names.

@@ -25,8 +25,6 @@ _SWING_SECONDS = 1.0  # there and back
 _GRAVITY = 9.81  # [m/s^2]
 
 _Rotations = dict[Part, NDArray]  # [frames, 3], local axis-angle in left, up, front [rad]
-
-
 # A movement takes the time since it began [s], shape [frames], and the height of the hips above the floor [m]; it
 # returns rotations and root offsets [m].
 
@@ -53,12 +51,9 @@ def jump(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
     height = np.where(is_flying, speed * air - 0.5 * _GRAVITY * air**2, height)
     sink = np.clip(-height, 0.0, 0.9 * leg)
     bend = np.arccos(1.0 - sink / leg)  # thigh and shank of equal length, each tilted by this
-    rotations: _Rotations = {}
-    left = np.array([1.0, 0.0, 0.0])
-    for side in ("left", "right"):
-        rotations[side, "upper_leg"] = -bend[:, None] * left
-        rotations[side, "lower_leg"] = 2 * bend[:, None] * left
-        rotations[side, "foot"] = -bend[:, None] * left
+    tilts = {"upper_leg": -bend, "lower_leg": 2 * bend, "foot": -bend}
+    sides = [(side, part) for side in ("left", "right") for part in tilts]
+    rotations = {joint: tilts[joint[1]][:, None] * [1.0, 0.0, 0.0] for joint in sides}
     return rotations, height[:, None] * [0.0, 1.0, 0.0]
 
 

@@ -9,7 +9,9 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import breadth_first_order
 
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.files.npz import check_layout
@@ -144,7 +146,6 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
 
 
 def _check_mesh(mesh: RiggedMesh) -> None:
-    """Raise unless a rigged mesh can be a body."""
     arrays = vars(mesh) | {"joints": mesh.skeleton.rest_positions}
     check_layout(arrays, _LAYOUT, what=f"body {mesh.name}", remedy="export it again")
     if not len(mesh.positions) or not len(mesh.faces):
@@ -161,24 +162,16 @@ def _check_mesh(mesh: RiggedMesh) -> None:
 
 def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
     """Make the hips joint 0, as motions have it; return the skeleton, and the old index of each of its joints."""
-    hips = find_parts(skeleton)["", "hips"][0]
-    neighbors: dict[int, list[int]] = {}
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            neighbors.setdefault(parent, []).append(joint)
-            neighbors.setdefault(joint, []).append(parent)
-    order, parents = [hips], [-1]
-    seen = {hips}
-    for place, joint in enumerate(order):
-        for other in neighbors.get(joint, []):
-            if other not in seen:
-                seen.add(other)
-                order.append(other)
-                parents.append(place)
+    hips, count = find_parts(skeleton)["", "hips"][0], len(skeleton)
     if hips == 0:
-        return skeleton, np.arange(len(skeleton))
-    names = tuple(skeleton.joint_names[joint] for joint in order)
-    return Skeleton(names, tuple(parents), skeleton.rest_positions[order]), np.array(order)
+        return skeleton, np.arange(count)
+    bones = np.array([pair for pair in enumerate(skeleton.parents) if pair[1] >= 0]).reshape(-1, 2)
+    graph = scipy.sparse.coo_array((np.ones(len(bones)), tuple(bones.T)), (count, count))
+    order, above = breadth_first_order(graph, hips, directed=False)
+    place = {joint: new for new, joint in enumerate(order.tolist())}
+    names = tuple(skeleton.joint_names[joint] for joint in place)
+    parents = tuple(place.get(int(above[joint]), -1) for joint in place)
+    return Skeleton(names, parents, skeleton.rest_positions[order]), order
 
 
 def make_motion(
@@ -231,7 +224,7 @@ def make_motion(
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
     if scale is None:
-        alignments = align_rests(target, source.skeleton, ours, theirs, source.name, source)
+        alignments = align_rests(target, source.skeleton, ours, theirs, source)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
         if other >= 0:

@@ -1,9 +1,10 @@
-"""Write the meshes of an Alembic file as arrays; run by `read_apart`.
+"""Write the meshes of an Alembic file as arrays; run by `formats/alembic.py`.
 
     python alembic.py FILE OUT.npz NAMES FRAMES
 
 NAMES are of the meshes to read, with commas, or nothing for all; FRAMES is how many samples of each. Positions
-stay in the space of the transforms above them, and corners in the order of the file.
+stay in the space of the transforms above them, and corners in the order of the file. It imports NumPy and its
+library alone, so that it starts at once.
 """
 
 from __future__ import annotations
