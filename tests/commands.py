@@ -2,10 +2,14 @@
 
 import contextlib
 import io
+import json
 import subprocess
 import sys
 import warnings
 from unittest import mock
+
+import numpy as np
+from scipy.spatial import cKDTree
 
 from eslr_jax.pipeline.cli import main
 
@@ -41,3 +45,21 @@ def refused(done, *causes):
     assert len(lines[0]) > 25  # more than a name
     for cause in causes:
         assert cause in lines[0]
+
+
+def worn(path, out, *options, frames=20):
+    """Simulate a garment file as the command does; return the report and the arrays."""
+    words = ("--simulator", "physics", "--frames", frames, "--no-pictures", "--json")
+    result = eslr("simulate", "--garment", path, *words, *options, "--out", out)
+    assert result.returncode == 0, result.stderr
+    with np.load(out / "trajectory.npz") as arrays:
+        return json.loads(result.stdout), dict(arrays)
+
+
+def slip(trajectory, band=0.03):
+    """Return how far the top of a garment sank along the body by the last frame [m]."""
+    cloth, body = trajectory["positions"], trajectory["body_positions"]
+    top = cloth[0, :, 1] > cloth[0, :, 1].max() - band
+    _, nearest = cKDTree(body[0]).query(cloth[0, top])
+    height = cloth[:, top, 1] - body[:, nearest, 1]
+    return float(np.mean(height[0] - height[-1]))

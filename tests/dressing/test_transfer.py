@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cloth import stand_at, turn_about
 from garment_files import TO_Z_UP, bundled, source
-from other_bodies import smpl_female
+from other_bodies import BODIES, measure, smpl_female
 
 from eslr_jax import ConfigError, MeshError
 from eslr_jax.mesh.topology import face_areas, unique_edges
@@ -124,3 +124,17 @@ def test_what_cannot_be_carried_is_told(body, shirt):
         transfer_garment(shirt, body, nameless)
     with pytest.raises(ConfigError, match="--made-for"):
         transfer_garment(dataclasses.replace(shirt, sewn_positions=shirt.rest_positions), body, body)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "garment"), [("figure", "longsleeve"), ("smpl_female", "pants")])
+def test_a_bundled_garment_sits_and_walks_on_another_body(name, garment):
+    """`experiments/other_bodies.py` measures all nine garments on all five bodies."""
+    ((row, *_),) = measure(make_body(BODIES[name]()), (garment,), frames=60)
+    assert row["inside_at_rest"] == 0
+    assert row["rest_inside_mm"] < 0.1
+    assert row["standing_p99_stretch"] < 1.15
+    assert row["standing_max_stretch"] < 1.2
+    assert row["rest_p99_stretch"] < 1.2  # with the arms up, where the body rests so
+    assert row["walk_finite"]
+    assert row["walk_p99_stretch"] < 1.4
