@@ -33,6 +33,15 @@ def make_sheet(rows=5, columns=6, spacing=0.05, *, seed=0, jitter=0.2):
     return positions.reshape(-1, 3), grid_faces(rows, columns)
 
 
+def dented_sheets(dent: float):
+    """Return two level sheets 1 cm apart, the middle of the upper one pushed down by a depth [m], as a bowl."""
+    flat, faces = make_sheet(13, 13, 0.02, jitter=0.1)
+    flat = flat - flat.mean(axis=0)
+    upper = flat + np.array([0.003, 0.01, 0.004])
+    upper[:, 1] -= dent * np.exp(-np.sum(upper[:, [0, 2]] ** 2, axis=1) / (2 * 0.04**2))
+    return np.concatenate([flat, upper]), np.concatenate([faces, faces + len(flat)])
+
+
 def make_garment(positions, faces, *, is_pinned=None, sewn_positions=None) -> Garment:
     """Return a garment that one joint carries."""
     ones = np.ones((len(positions), 1))

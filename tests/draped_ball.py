@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from cloth import grid_faces
 
 from eslr_jax import prepare_garment
 from eslr_jax.mesh.surface import prepare_surface
@@ -21,14 +22,10 @@ def ball(rings: int = 7, around: int = 12) -> tuple[np.ndarray, np.ndarray]:
         np.sin(polar)[:, None] * np.sin(angle), np.cos(polar)[:, None], np.sin(polar)[:, None] * np.cos(angle)
     ), axis=-1).reshape(-1, 3)  # fmt: skip
     positions = np.concatenate([ring, [[0, 1, 0]], [[0, -1, 0]]]) * RADIUS
-    index = np.arange(rings * around).reshape(rings, around)
-    after = np.roll(index, -1, axis=1)
-    a, b, c, d = index[:-1].ravel(), index[1:].ravel(), after[1:].ravel(), after[:-1].ravel()
-    top, bottom = len(positions) - 2, len(positions) - 1
-    faces = [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
-    faces.append(np.stack([np.full(around, top), index[0], after[0]], 1))
-    faces.append(np.stack([np.full(around, bottom), after[-1], index[-1]], 1))
-    return positions, np.concatenate(faces)
+    first, second = np.split(grid_faces(rings, around, is_closed=True), 2)
+    index, top = np.arange(rings * around).reshape(rings, around), np.full(around, len(positions) - 2)
+    caps = [top, index[0], np.roll(index[0], -1)], [top + 1, np.roll(index[-1], -1), index[-1]]
+    return positions, np.concatenate([second, first, *(np.stack(cap, 1) for cap in caps)])
 
 
 def square(side: int = 8, size: float = 0.24, *, is_pinned: np.ndarray | None = None) -> Garment:
@@ -37,12 +34,10 @@ def square(side: int = 8, size: float = 0.24, *, is_pinned: np.ndarray | None = 
         np.linspace(-0.5, 0.5, side) * size, np.linspace(-0.5, 0.5, side) * size, indexing="ij"
     )
     positions = np.stack([x, np.full_like(x, RADIUS + 0.004), z], axis=-1).reshape(-1, 3)
-    index = np.arange(side * side).reshape(side, side)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     share = (x.ravel() / size + 0.5)[:, None]
     return prepare_garment(
         positions,
-        np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]),
+        grid_faces(side, side)[:, [0, 2, 1]],
         skin_weights=np.concatenate([share, 1 - share], axis=1),
         skin_indices=np.broadcast_to([0, 1], (side * side, 2)),
         is_pinned=is_pinned,

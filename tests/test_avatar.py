@@ -89,38 +89,6 @@ def test_a_mesh_in_motion_is_a_body(tmp_path, walk):
 
 
 @pytest.mark.slow
-def test_what_contradicts_is_refused_in_one_line(tmp_path):
-    moving, out = tmp_path / "body.npz", tmp_path / "out"
-    np.savez(moving, positions=np.zeros((2, 3, 3)), faces=np.array([[0, 1, 2]]))
-    result = eslr("simulate", "--body", moving, "--motion", "turn", "--frames", 2, "--out", out)
-    assert result.returncode == 2, result.stderr
-    (line,) = [line for line in result.stderr.splitlines() if line.startswith("eslr: ")]
-    assert "follows no other" in line
-    assert not out.exists(), "what is refused leaves no folder"
-
-
-def test_the_joint_map_is_printed_and_written(avatar, tmp_path):
-    path = tmp_path / "map.json"
-    printed, _ = done("joints", "--body", "anny", "--motion", avatar / "avatar.glb", "--out", path, "--json")
-    found = json.loads(printed)
-    assert json.loads(path.read_text()) == found
-    assert found["LeftArm"] == "mixamorig:LeftArm"
-    assert found["Spine1"] == "mixamorig:Spine2"
-
-
-@pytest.mark.slow
-def test_a_character_of_200_m_is_scaled_with_a_line_and_wears_a_bundled_garment(tmp_path, body):
-    write_walker(tmp_path / "giant.glb", tmp_path / "shirt.obj", body, size=118.0)
-    report, said = simulate(tmp_path / "out", "--body", tmp_path / "giant.glb")
-    assert "taken to be in cm" in said
-    assert report["motion"].endswith("giant.glb")
-    run = load_trajectory(tmp_path / "out")
-    assert 1.5 < np.ptp(run.body.positions[-1][:, 1]) < 2.2
-    assert report["max_principal_stretch"] < 2.0
-    assert report["penetration_max_mm"] < 1.0
-
-
-@pytest.mark.slow
 def test_the_default_shirt_is_carried_to_a_smpl_file(tmp_path):
     write_smpl(tmp_path / "smpl.pkl", smpl_female())
     report, said = simulate(tmp_path / "out", "--body", tmp_path / "smpl.pkl")

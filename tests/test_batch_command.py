@@ -5,7 +5,6 @@ import os
 import signal
 import threading
 import time
-import warnings
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from eslr_jax.pipeline.cli.batch import (
     read_manifest,
     read_scenes,
     shared_reach,
-    simulate_scene,
     simulate_scenes,
 )
 from eslr_jax.pipeline.report.run import read_run
@@ -108,23 +106,6 @@ def test_commands_that_cannot_be_begun_are_one_line(tmp_path, monkeypatch):
     refused(eslr_here("score", "."), "holds no")  # a folder without a manifest is none of a batch
     (tmp_path / MANIFEST).write_text("{}")
     refused(eslr_here("score", "."), "manifest.json is damaged")
-
-
-def test_a_scene_that_fails_leaves_its_cause_and_no_folder(tmp_path):
-    done = eslr_here_quiet(simulate_scene, {"garment": ["tshrit"], "frames": 2}, tmp_path / "a")
-    assert "did you mean tshirt" in done
-    assert not list(tmp_path.iterdir())
-
-
-def eslr_here_quiet(task, options, folder):
-    """Run a task of a worker in this process, and put back what it changes."""
-    from eslr_jax.pipeline.cli import console
-
-    try:
-        with warnings.catch_warnings():
-            return task(options, None, str(folder), os.getcwd())
-    finally:
-        console.stderr.quiet = False
 
 
 FEW = """

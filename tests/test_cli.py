@@ -12,18 +12,17 @@ import jax
 import numpy as np
 import pytest
 from commands import eslr, eslr_here, refused
-from foreign_files import smpl_model, write_amass, write_bvh
+from foreign_files import moving, smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 from own_term import Push
 
-from eslr_jax import ConfigError, load_body, load_motion
+from eslr_jax import ConfigError, MotionError, load_body, load_motion, pose_body
 from eslr_jax.config import from_dict
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.cli.console import use_compile_cache
 from eslr_jax.pipeline.cli.method import choose_method
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.garment import read_garment_npz
-from eslr_jax.pipeline.rigs.rig import skeleton_motion
 from eslr_jax.terms import Contact
 
 
@@ -89,16 +88,24 @@ def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("iterations", "integrator"), [(0, "euler"), (5, "bdf2")])
-def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
-    tmp_path, iterations, integrator
+@pytest.mark.parametrize(
+    ("options", "integrator", "method"),
+    [
+        (("--iterations", 0), "euler", "smooth-small"),
+        ((), "bdf2", "smooth-small, then 10 iterations of the solver"),
+    ],
+)
+def test_a_network_alone_steps_as_it_was_trained_and_iterations_that_are_added_are_announced(
+    tmp_path, options, integrator, method
 ):
-    options = ("--model", "smooth-small", "--iterations", iterations, "--frames", 3, "--no-pictures")
-    result = eslr("simulate", *options, "--out", tmp_path, "--json")
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
-    assert report["integrator"] == integrator
+    words = ("--model", "smooth-small", "--frames", 3, "--settle", 0, "--no-pictures", "--json")
+    done = eslr("simulate", *words, *options, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["integrator"], report["model"]) == (integrator, method)
     assert report["finite"]
+    line = f"a frame is solved by {method}; --iterations 0 is the network alone"
+    assert done.stderr.splitlines().count(line) == (not options)
 
 
 def test_a_compile_cache_that_is_set_is_kept(monkeypatch, tmp_path):
@@ -158,10 +165,17 @@ def test_commands_silence_the_log_of_xla_before_jax_reads_the_setting():
     assert found.stdout.split()[-1] == "3"
 
 
-def test_assets_lists_every_kind():
-    result = eslr_here("assets", "--json", "--verify")
-    kinds = {asset["kind"] for asset in json.loads(result.stdout)}
-    assert {"body", "garment", "motion", "fabric"} <= kinds
+def test_assets_lists_every_kind(body):
+    listed = json.loads(eslr_here("assets", "--json", "--verify").stdout)
+    assert {"body", "garment", "motion", "fabric"} <= {asset["kind"] for asset in listed}
+    (clip,) = (asset for asset in listed if asset["name"] == "cmu_016_22")
+    poses = pose_body(body, load_motion("cmu_016_22"), num_frames=clip["frames"])
+    assert len(poses.positions) == clip["frames"]
+    with pytest.raises(MotionError, match="fewer than"):
+        pose_body(body, load_motion("cmu_016_22"), num_frames=clip["frames"] + 1)
+    fabrics = json.loads(eslr_here("assets", "--kind", "fabric", "--json").stdout)
+    assert all(fabric["source"] and fabric["density"] > 0 for fabric in fabrics.values())
+    assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
 
 
 def test_what_runs_keep_is_shown_and_removed(tmp_path, monkeypatch):
@@ -206,13 +220,6 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
     (tmp_path / "mine.json").write_bytes(bundled.with_suffix(".json").read_bytes())
     monkeypatch.chdir(tmp_path)
     assert shown("mine")["model"] == "mine"
-
-
-def test_fabrics_are_listed_with_their_sources():
-    fabrics = json.loads(eslr_here("assets", "--kind", "fabric", "--json").stdout)
-    assert {"cotton", "denim", "silk"} <= set(fabrics)
-    assert all(fabric["source"] and fabric["density"] > 0 for fabric in fabrics.values())
-    assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
 
 
 @pytest.mark.slow
@@ -306,20 +313,8 @@ def test_a_budget_buys_iterations_of_the_solver_and_of_a_network():
     assert alone.pace(alone.config.iterations, 1e3) == 5
 
 
-@pytest.mark.slow
-def test_iterations_that_are_added_to_a_network_are_announced(tmp_path):
-    words = ("--frames", 3, "--settle", 0, "--no-pictures", "--json", "--out", tmp_path)
-    done = eslr("simulate", "--model", "smooth-small", *words)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["model"] == "smooth-small, then 10 iterations of the solver"
-    assert report["iterations_mean"] == 10
-    line = f"a frame is solved by {report['model']}; --iterations 0 is the network alone"
-    assert done.stderr.splitlines().count(line) == 1
-
-
-def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path):
-    walk = skeleton_motion(load_motion("cmu_016_32"), load_body())
+def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, body):
+    walk = moving(body)
     bones = [f"Bone.{number:03}" for number in range(len(walk.skeleton.joint_names))]
     write_bvh(tmp_path / "a.bvh", walk, names=bones)
     done = eslr_here("joints", "--motion", tmp_path / "a.bvh", "--out", tmp_path / "map.json")

@@ -115,13 +115,6 @@ def test_what_networks_have_not_seen_is_named():
     assert beyond_training(COTTON.replace(bending_stiffness=np.float32(1e-9))) == ("bending_stiffness",)
 
 
-def test_fabric_of_the_file_is_the_default(two_fabrics):
-    stored, garment = two_fabrics
-    stored = dataclasses.replace(stored, metadata={"fabrics": ["satin"]})
-    assert garment_material((), garment, stored).density == fabric_material("satin").density
-    assert garment_material(("denim",), garment, stored).density == fabric_material("denim").density
-
-
 @pytest.mark.parametrize(("text", "named"), [
     ("denin", "denim"), ("weight=3", "density"), ("density=heavy", "heavy"), ("density=-1", "density"),
     ("density=nan", "density"), ("warp_stretch=100,coupling=100", "coupling"), ("collar:silk", "right, left"),

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from contact import OUTFITS, dressed, judge, load
-from garment_files import bundled
+from garment_files import bundled, stored
 from garment_shapes import rings
 
 from eslr_jax import AssetError, MeshError, simulate
@@ -22,10 +22,7 @@ from eslr_jax.pipeline.report.crossing import intersecting_pairs
 def tube(radius: float, bottom: float, top: float) -> GarmentFile:
     """Return a tube of cloth around the vertical, its normals outwards."""
     positions, faces = rings([(top, radius, radius, 0.0), (bottom, radius, radius, 0.0)], around=24, rows=7)
-    count = len(positions)
-    return GarmentFile(
-        positions, faces, np.ones((count, 1)), np.zeros((count, 1), int), np.zeros(count, bool)
-    )
+    return stored(positions, faces)
 
 
 def test_a_garment_beneath_another_is_moved_over_it_and_keeps_its_lengths():
@@ -129,7 +126,9 @@ def renamed(body):
 
 
 def test_its_own_body_wears_it(file, tank, body):
-    assert load_garment_file(file, body=body).metadata == tank.metadata
+    worn = load_garment_file(file, body=body)
+    np.testing.assert_allclose(worn.rest_positions, tank.rest_positions, atol=1e-6)
+    assert worn.metadata == tank.metadata
     assert load_garment_file(file, body=larger(body, NUDGE)).metadata == tank.metadata
 
 

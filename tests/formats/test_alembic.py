@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from broken import refuses
+from garment_files import stored
 from scipy.spatial.transform import Rotation
 
 from eslr_jax import AssetError
@@ -15,7 +16,7 @@ from eslr_jax.pipeline.cli.method import is_moving_mesh, load_actor
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, vertex_normals
 from eslr_jax.pipeline.formats.export import export_trajectory
-from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_source
+from eslr_jax.pipeline.formats.garment import read_garment_source
 from eslr_jax.pipeline.formats.gltf import TOLERANCE
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence, read_mesh_sequences
 from eslr_jax.pipeline.formats.trajectory import TrajectoryFile
@@ -123,10 +124,7 @@ def test_usd_glb_and_abc_of_a_run_agree(tmp_path):
     body = AnimatedMesh("body", positions[:, ::-1], VERTICES - 1 - FACES, rest_positions=positions[0, ::-1])
     run = TrajectoryFile(positions, SHIRT.velocities, FACES, STEP, {"garment": "tank"}, body)
     half = np.arange(len(FACES)) % 2
-    garment = GarmentFile(
-        positions[0], FACES, np.ones((VERTICES, 1)), np.zeros((VERTICES, 1), int), np.zeros(VERTICES, bool),
-        face_parts=half, part_names=("front", "back"),
-    )  # fmt: skip
+    garment = stored(positions[0], FACES, face_parts=half, part_names=("front", "back"))
     path = export_trajectory(run, tmp_path / "run.abc", garment=garment)
     cloth, wearer = read_mesh_sequences(path)
     stage = usd.Stage.Open(str(export_trajectory(run, tmp_path / "run.usdc", garment=garment)))

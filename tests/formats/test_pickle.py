@@ -4,12 +4,9 @@ import collections
 import os
 import pickle
 import struct
-import sys
-import types
 
 import numpy as np
 import pytest
-import scipy.sparse
 
 from eslr_jax import AssetError
 from eslr_jax.pipeline.formats.pickle import read_pickle
@@ -43,27 +40,6 @@ def test_arrays_and_containers_come_back(tmp_path, protocol):
     np.testing.assert_array_equal(loaded["nested"][0]["center"], [1, 2])
     assert loaded["nested"][1] == value["nested"][1]
     assert loaded["again"] is loaded["same"]
-
-
-@pytest.mark.parametrize("protocol", [0, 1, 2])
-def test_body_model_layout_of_python_2(tmp_path, protocol, monkeypatch):
-    chumpy = types.ModuleType("chumpy.ch")
-
-    class Ch:
-        pass
-
-    Ch.__module__, Ch.__qualname__ = "chumpy.ch", "Ch"
-    chumpy.Ch = Ch
-    monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
-    monkeypatch.setitem(sys.modules, "chumpy.ch", chumpy)
-    shapes = Ch()
-    shapes.__dict__.update(x=np.arange(30.0).reshape(5, 3, 2), _cache=object)
-    regressor = scipy.sparse.csc_matrix(np.eye(2, 5))
-    path = dump(tmp_path, {"shapedirs": shapes, "J_regressor": regressor}, protocol)
-    monkeypatch.undo()
-    loaded = read_pickle(path, content="body")
-    np.testing.assert_array_equal(loaded["shapedirs"], np.arange(30.0).reshape(5, 3, 2))
-    np.testing.assert_array_equal(loaded["J_regressor"].toarray(), np.eye(2, 5))
 
 
 class Hostile:

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import eslr, slip, worn
-from foreign_files import smpl_parameters, write_amass, write_hood
+from foreign_files import moving, smpl_parameters, write_amass, write_hood
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress, write_obj
 from PIL import Image
 
-from eslr_jax import load_motion
 from eslr_jax.pipeline.report.fields import run_field
 from eslr_jax.pipeline.report.run import read_run
-from eslr_jax.pipeline.rigs.rig import skeleton_motion
 
 pytestmark = pytest.mark.slow
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -26,7 +24,7 @@ def motions(tmp_path_factory, body):
     folder = tmp_path_factory.mktemp("motions")
     for name in ("cmu_01_01.bvh", "makehuman_walk1.bvh"):
         shutil.copy(FIXTURES / name, folder / name)
-    rotations, pelvis = smpl_parameters(skeleton_motion(load_motion("cmu_047_01"), body))
+    rotations, pelvis = smpl_parameters(moving(body, "cmu_047_01"))
     write_amass(folder / "amass.npz", rotations, pelvis, 30.0)
     write_hood(folder / "hood.pkl", rotations, pelvis)
     return folder

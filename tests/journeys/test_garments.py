@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from commands import eslr, slip, worn
-from garment_files import scanned_tshirt
+from garment_files import cut_apart, scanned_tshirt
 from garment_shapes import rings, shorts, skirt, write_obj
 
 from eslr_jax import load_garment
@@ -53,14 +53,7 @@ def test_a_garment_modelled_on_the_exported_body_fits_exactly(tmp_path, body):
 def test_panels_are_sewn_before_the_waist_is_looked_for(tmp_path, body):
     positions, faces = skirt()
     is_left = positions[faces].mean(axis=1)[:, 0] > 0
-    left, right = (np.unique(faces[part]) for part in (is_left, ~is_left))
-    number = np.zeros((2, len(positions)), int)
-    number[0, left], number[1, right] = np.arange(len(left)), len(left) + np.arange(len(right))
-    panels = (
-        np.concatenate([positions[left] + [0.004, 0, 0], positions[right]]),
-        np.concatenate([number[0, faces[is_left]], number[1, faces[~is_left]]]),
-    )
-    path = write_obj(tmp_path / "skirt.obj", panels)
+    path = write_obj(tmp_path / "skirt.obj", cut_apart(positions, faces, is_left, [0.004, 0, 0]))
     apart = load(path, body)
     assert "nothing holds the garment up" in " ".join(apart.metadata["fit"]["warnings"])
     sewn = load(path, body, components="join", join_gap=0.01)

@@ -98,7 +98,8 @@ SIMULATE = {
         "turn --motion jump": "--motion is given twice",
     }.items()},
     **{f"--body {file}": cause for file, cause in {
-        "one-frame.npz": "", "garment.fbx": "", "nothing": "", "noise.pkl": "", "robot": "anny",
+        "flat-body.npz --motion turn": "follows no other", "one-frame.npz": "",
+        "garment.fbx": "", "nothing": "", "noise.pkl": "", "robot": "anny",
     }.items()},
     "--garment tshrit": "tshirt", "--garment missing.obj": "missing.obj", "--garment empty.obj": "empty",
     "--garment tshirt --garment tshirt": "worn once only",
