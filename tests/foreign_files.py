@@ -178,14 +178,6 @@ def smpl_model(body, rng):
     }
 
 
-def write_smpl(path, mesh):
-    """Write a body on SMPL's 24 joints, a RiggedMesh, as a SMPL pickle without blend shapes."""
-    joints, count = mesh.skeleton.rest_positions, len(mesh.positions)
-    values = smpl_layout(mesh.positions, mesh.faces, mesh.skin_weights, mesh.skin_indices, joints)
-    values |= {"shapedirs": np.zeros((count, 3, 10)), "posedirs": np.zeros((count, 3, 207))}
-    path.write_bytes(pickle.dumps(values, protocol=2))
-
-
 def joint_regressor(positions, joints):
     """Weights of 40 vertices around each joint that give the joint's position."""
     regressor = np.zeros((len(joints), len(positions)))

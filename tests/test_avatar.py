@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 from commands import eslr
-from foreign_files import write_smpl, write_walker
+from foreign_files import write_walker
 from garment_shapes import write_obj
-from other_bodies import smpl_female
 
 from eslr_jax import load_garment, load_motion, load_trajectory, pose_body, prepare_scene
 
@@ -86,13 +85,3 @@ def test_a_mesh_in_motion_is_a_body(tmp_path, walk):
     simulate(out, "--body", moving, "--garment", garment, frames=None)
     run = load_trajectory(out)
     np.testing.assert_allclose(run.body.positions, walk.positions[:5], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_the_default_shirt_is_carried_to_a_smpl_file(tmp_path):
-    write_smpl(tmp_path / "smpl.pkl", smpl_female())
-    report, said = simulate(tmp_path / "out", "--body", tmp_path / "smpl.pkl")
-    assert report["garment"] == "tshirt"
-    assert report["max_principal_stretch"] < 2.0
-    assert report["penetration_max_mm"] < 1.0
-    assert "tshirt carried to " in said

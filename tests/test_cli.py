@@ -166,7 +166,10 @@ def test_commands_silence_the_log_of_xla_before_jax_reads_the_setting():
 
 
 def test_assets_lists_every_kind(body):
-    listed = json.loads(eslr_here("assets", "--json", "--verify").stdout)
+    done = eslr_here("assets", "--json", "--verify")
+    assert done.returncode == 0, done.stderr
+    listed = json.loads(done.stdout)
+    assert all(asset["source"] and (asset["kind"] == "fabric" or asset["licence"]) for asset in listed)
     assert {"body", "garment", "motion", "fabric"} <= {asset["kind"] for asset in listed}
     (clip,) = (asset for asset in listed if asset["name"] == "cmu_016_22")
     poses = pose_body(body, load_motion("cmu_016_22"), num_frames=clip["frames"])
