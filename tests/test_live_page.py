@@ -194,10 +194,11 @@ def test_a_recording_that_a_hand_pulled_at_is_not_scored(player):
 def test_a_recording_ends_after_a_minute_and_with_what_it_shows(player, monkeypatch):
     live, controls = player.live, player.live.controls
 
-    def ended_by(change):
+    def ended_by(change, undo=lambda: None):
         player.record(3)
         change()
         player.until(lambda: not controls["record"].value and not live.recorded)
+        undo()
         player.wait(1)
         run = player.newest_run()
         assert run.trajectory.num_frames >= 3
@@ -215,8 +216,8 @@ def test_a_recording_ends_after_a_minute_and_with_what_it_shows(player, monkeypa
     assert run.report["wind_m_s"] == [0.0, 0.0, 5.0]
     np.testing.assert_allclose(run.scene.material.density, fabric_material("cotton").density, rtol=1e-6)
     np.testing.assert_allclose(run.scene.terms[-1].wind, [0.0, 0.0, 5.0])
-    ended_by(set_control(controls["garments"][1], "tshirt"))  # which does not load, over itself
-    controls["garments"][1].value = "nothing"
+    second = controls["garments"][1]
+    ended_by(set_control(second, "tshirt"), set_control(second, "nothing"))  # it does not load, over itself
     controls["wind"].value, controls["fabric"].value = 0.0, "cotton"
     player.wait(1)
 

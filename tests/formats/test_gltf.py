@@ -24,7 +24,7 @@ _TYPES = {
     gltf.UNSIGNED_SHORT: np.uint16,
     gltf.UNSIGNED_INT: np.uint32,
 }
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class Player:

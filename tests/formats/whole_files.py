@@ -63,7 +63,8 @@ def whole_garment(kind: str, path: Path) -> None:
     elif kind in ("ply", "stl", "glb"):
         path.write_bytes(mesh.export(file_type=kind))
     elif kind == "npz":
-        np.savez(path, **{"positions": POSITIONS, "faces": FACES})
+        with path.open("wb") as stream:  # whatever its suffix
+            np.savez(stream, positions=POSITIONS, faces=FACES)
     elif kind == "pkl":
         entry = {"rest_pos": POSITIONS, "faces": FACES, "node_type": np.array([[0], [0], [3], [0], [0]])}
         path.write_bytes(pickle.dumps({"scarf": entry}))
