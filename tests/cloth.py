@@ -87,19 +87,20 @@ def make_limb() -> Body:
     return jax.tree.map(jnp.asarray, limb)
 
 
+def shaped(body: Body, place) -> Body:
+    """Return a body whose rest pose is elsewhere: `place` maps its places [m]."""
+    fields = ("rest_positions", "joint_rest_positions")
+    return body.replace(**{name: np.float32(place(np.asarray(getattr(body, name)))) for name in fields})
+
+
 def stand_at(body: Body, offset) -> Body:
     """Return a body whose rest pose stands elsewhere, by an offset [m]."""
-    offset = np.asarray(offset, np.float32)
-    return body.replace(
-        rest_positions=np.asarray(body.rest_positions) + offset,
-        joint_rest_positions=np.asarray(body.joint_rest_positions) + offset,
-    )
+    return shaped(body, lambda places: places + np.float32(offset))
 
 
 def turn_about(body: Body, turn: np.ndarray) -> Body:
     """Return a body whose rest pose is turned about the origin: every place p is at p @ turn."""
-    fields = ("rest_positions", "joint_rest_positions")
-    return body.replace(**{name: np.asarray(getattr(body, name)) @ np.float32(turn) for name in fields})
+    return shaped(body, lambda places: places @ np.float32(turn))
 
 
 def swing_motion(body: Body, num_frames: int, *, sway: float = 0.02) -> Motion:

@@ -36,6 +36,12 @@ def eslr_here(*words):
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
+def succeeded(done):
+    """Check that a command ended well, and return it."""
+    assert done.returncode == 0, done.stderr
+    return done
+
+
 def refused(done, *causes):
     """Check that a command ended with exit code 2 and one line that names the cause and what to do."""
     lines = [line for line in done.stderr.splitlines() if line.startswith("eslr: ")]
@@ -47,13 +53,20 @@ def refused(done, *causes):
         assert cause in lines[0]
 
 
-def worn(path, out, *options, frames=20):
-    """Simulate a garment file as the command does; return the report and the arrays."""
-    words = ("--simulator", "physics", "--frames", frames, "--no-pictures", "--json")
-    result = eslr("simulate", "--garment", path, *words, *options, "--out", out)
-    assert result.returncode == 0, result.stderr
+def simulated(out, *words):
+    """Simulate by the solver; return the report, and what is said beside it."""
+    options = ("--simulator", "physics", "--no-pictures", "--json", "--out", out)
+    done = succeeded(eslr("simulate", *words, *options))
+    report = json.loads(done.stdout)
+    assert report["finite"]
+    return report, done.stderr
+
+
+def worn(out, *words):
+    """Simulate by the solver; return the report, and the arrays of the trajectory."""
+    report, _ = simulated(out, *words)
     with np.load(out / "trajectory.npz") as arrays:
-        return json.loads(result.stdout), dict(arrays)
+        return report, dict(arrays)
 
 
 def slip(trajectory, band=0.03):

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import eslr, eslr_here, refused
+from commands import eslr, eslr_here, refused, simulated, succeeded
 from foreign_files import moving, smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 from own_term import Push
@@ -28,11 +28,8 @@ from eslr_jax.terms import Contact
 
 @pytest.mark.slow
 def test_simulate_writes_everything(tmp_path):
-    result = eslr(
-        "simulate", "--simulator", "physics", "--frames", 4, "--iterations", 20, "--out", tmp_path, "--json"
-    )
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
+    words = ("--simulator", "physics", "--frames", 4, "--iterations", 20, "--json")
+    report = json.loads(succeeded(eslr("simulate", *words, "--out", tmp_path)).stdout)
     for key in (
         "finite", "num_frames", "num_vertices", "terms", "total", "max_principal_stretch",
         "penetration_p999_mm", "penetration_max_mm", "penetrating_share", "frame_ms", "compile_s", "device",
@@ -74,13 +71,10 @@ def test_a_term_that_can_not_be_made_is_refused_in_one_line(text, reason):
 @pytest.mark.slow
 def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled there yet
-    words = ("simulate", "--simulator", "physics", "--iterations", 20, "--frames", 4, "--no-pictures")
-    reports = []
-    for _ in range(2):
-        result = eslr(*words, "--json", "--out", tmp_path / "run")
-        assert result.returncode == 0, result.stderr
-        reports.append((json.loads(result.stdout)["compile_s"], result.stderr))
-    (first, told), (second, untold) = reports
+    (one, told), (other, untold) = (
+        simulated(tmp_path / "run", "--iterations", 20, "--frames", 4) for _ in range(2)
+    )
+    first, second = one["compile_s"], other["compile_s"]
     assert first > 5
     assert f"waited {first:.0f} s for the compiler" in told
     assert second < 0.5 * first
@@ -99,8 +93,7 @@ def test_a_network_alone_steps_as_it_was_trained_and_iterations_that_are_added_a
     tmp_path, options, integrator, method
 ):
     words = ("--model", "smooth-small", "--frames", 3, "--settle", 0, "--no-pictures", "--json")
-    done = eslr("simulate", *words, *options, "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr("simulate", *words, *options, "--out", tmp_path))
     report = json.loads(done.stdout)
     assert (report["integrator"], report["model"]) == (integrator, method)
     assert report["finite"]
@@ -166,8 +159,7 @@ def test_commands_silence_the_log_of_xla_before_jax_reads_the_setting():
 
 
 def test_assets_lists_every_kind(body):
-    done = eslr_here("assets", "--json", "--verify")
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr_here("assets", "--json", "--verify"))
     listed = json.loads(done.stdout)
     assert all(asset["source"] and (asset["kind"] == "fabric" or asset["licence"]) for asset in listed)
     assert {"body", "garment", "motion", "fabric"} <= {asset["kind"] for asset in listed}
@@ -210,8 +202,7 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
     from eslr_jax.pipeline.assets.catalog import find_asset
 
     def shown(model):
-        done = eslr_here("info", "--model", model, "--json")
-        assert done.returncode == 0, done.stderr
+        done = succeeded(eslr_here("info", "--model", model, "--json"))
         return json.loads(done.stdout)
 
     assert shown("eslr-small")["config"]["refinement_steps"] == 14  # also an architecture, of twelve steps
@@ -229,8 +220,7 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
 def test_scanned_shirt_to_a_stable_simulation_in_one_command(tmp_path, body):
     """An OBJ with seams, in centimetres, Z up, 5 mm inside the body: no option but the file."""
     scan = scanned_tshirt(tmp_path / "shirt.obj", body)
-    result = eslr("simulate", "--garment", scan, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = succeeded(eslr("simulate", "--garment", scan, cwd=tmp_path))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["finite"]
     assert report["num_frames"] > 100
@@ -244,17 +234,12 @@ def test_fit_writes_a_garment_and_a_picture(tmp_path, body):
     scan = scanned_tshirt(tmp_path / "shirt.obj", body)
     options = ("--pin", "loop:top", "--fabric", "silk", "front:denim", "--json")
     (tmp_path / "fitted.png").write_bytes(b"texture")
-    result = eslr("fit", scan, "--out", tmp_path / "fitted.npz", *options)
-    assert result.returncode == 0, result.stderr
+    result = succeeded(eslr("fit", scan, "--out", tmp_path / "fitted.npz", *options))
     assert (tmp_path / "fitted.png").read_bytes() == b"texture"
     assert json.loads(result.stdout)["pinned"] > 10
     assert (tmp_path / "fitted_fit.png").stat().st_size > 10_000
-    run = ("--simulator", "physics", "--frames", 4, "--no-pictures", "--json", "--out", tmp_path / "run")
-    result = eslr("simulate", "--garment", tmp_path / "fitted.npz", *run)
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
+    report, _ = simulated(tmp_path / "run", "--garment", tmp_path / "fitted.npz", "--frames", 4)
     assert report["fabric"] == ["silk", "front:denim"]
-    assert report["finite"]
     assert (tmp_path / "run" / "garment.npz").exists()
 
 

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from commands import eslr_here
+from commands import eslr_here, succeeded
 
 from eslr_jax import ConfigError, TrainConfig
 from eslr_jax.config import apply_overrides, parse_override
@@ -15,8 +15,7 @@ RECIPES = Path(__file__).parents[1] / "experiments" / "configs"
 
 
 def test_train_shows_what_every_key_is():
-    done = eslr_here("train", "--keys")
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr_here("train", "--keys"))
     shown = " ".join(done.stdout.replace("│", " ").split())
     kinds = {type(model) for model in MODELS.values()}
     parts = shown.split("usage: eslr train --keys")

@@ -2,34 +2,31 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
-from commands import eslr, refused
+from commands import eslr, refused, simulated, succeeded
 from peers import SCORE, describe_rollout, make_scene
+
+from eslr_jax.pose.lbs import skin_garment
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A short run, and its garment as other programs write it."""
     folder = tmp_path_factory.mktemp("score")
-    options = ("--simulator", "physics", "--iterations", 50, "--frames", 8, "--no-pictures")
-    done = eslr("simulate", *options, "--out", folder / "run")
-    assert done.returncode == 0, done.stderr
+    simulated(folder / "run", "--iterations", 50, "--frames", 8)
     return folder
 
 
 @pytest.fixture(scope="module")
 def carried(tshirt, walk):
     """A T-shirt that the joints carry."""
-    rest, weights = (np.asarray(part) for part in (tshirt.rest_positions, tshirt.skin_weights))
-    transforms = np.asarray(walk.joint_transforms)[:, np.asarray(tshirt.skin_indices)]
-    moved = np.einsum("tvkab,vb->tvka", transforms[..., :3], rest) + transforms[..., 3]
-    return np.einsum("vk,tvka->tva", weights, moved).astype(np.float32)
+    return np.asarray(jax.jit(skin_garment)(tshirt, walk.joint_transforms))
 
 
 def scored(*arguments):
-    done = eslr("score", *arguments, "--json", "--every", 2)
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr("score", *arguments, "--json", "--every", 2))
     return json.loads(done.stdout)
 
 
@@ -52,10 +49,8 @@ def test_a_run_its_glb_and_its_npz_score_as_the_run_s_report_says(folder):
 @pytest.mark.slow
 def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
     worn = ("--garment", "pants", "--garment", "tshirt")
-    options = ("--simulator", "physics", "--iterations", 30, "--frames", 4, "--no-pictures", "--settle", 0)
-    done = eslr("simulate", *worn, *options, "--out", tmp_path / "run", "--integrator", "euler")
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    options = ("--iterations", 30, "--frames", 4, "--settle", 0, "--integrator", "euler")
+    report, _ = simulated(tmp_path / "run", *worn, *options)
     glb = tmp_path / "run" / "animation.glb"
     refused(eslr("score", glb), "pants, tshirt", "--garment for every garment")
     score = scored(glb, "--run", tmp_path / "run")
@@ -70,16 +65,14 @@ def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
         ours = sum(row["intersections_cloth"] for row in score["garments"].values())
         assert score["intersections_cloth"] <= ours <= 2 * score["intersections_cloth"]
     assert score["gap_relative_median"] < 0.1
-    named = eslr("score", glb, *worn)
-    assert named.returncode == 0, named.stderr
+    named = succeeded(eslr("score", glb, *worn))
     assert [line.split()[0] for line in named.stdout.splitlines()[-2:]] == ["pants", "tshirt"]
 
 
 @pytest.mark.slow
 def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_table(folder, carried, tshirt):
     np.savez(folder / "carried.npz", positions=carried, faces=np.asarray(tshirt.faces))
-    done = eslr("score", folder / "carried.npz", "--motion", "cmu_016_32")
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr("score", folder / "carried.npz", "--motion", "cmu_016_32"))
     assert "optimality gap" in done.stdout
     assert "the garment stays where it was put on" in done.stdout
     score = scored(folder / "carried.npz")

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cloth import shaped
 from contact import OUTFITS, dressed, judge, load
 from garment_files import bundled, stored
 from garment_shapes import rings
@@ -148,9 +149,7 @@ def test_a_body_of_another_shape_does_not(file, body):
 
 
 def test_a_garment_that_is_carried_tells_its_new_body(body):
-    taller = body.replace(
-        rest_positions=1.1 * body.rest_positions, joint_rest_positions=1.1 * body.joint_rest_positions
-    )
+    taller = shaped(body, lambda places: 1.1 * places)
     carried = transfer_garment(bundled("tank_1k"), body, taller)
     joint = carried.metadata["body"]["joint_rest_positions"][3]
     assert joint == pytest.approx(taller.joint_rest_positions[3].tolist(), abs=1e-5)

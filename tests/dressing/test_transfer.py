@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from cloth import stand_at, turn_about
+from cloth import shaped, stand_at, turn_about
 from garment_files import TO_Z_UP, bundled, source
 from other_bodies import BODIES, measure, smpl_female
 
@@ -36,8 +36,7 @@ def woman():
 @pytest.fixture(scope="module")
 def small(body):
     """The bundled body at seven tenths."""
-    fields = ("rest_positions", "joint_rest_positions")
-    return body.replace(**{name: SMALLER * getattr(body, name) for name in fields})
+    return shaped(body, lambda places: SMALLER * places)
 
 
 def lengths(positions, faces):

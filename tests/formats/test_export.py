@@ -9,7 +9,7 @@ import numpy as np
 import pygltflib as gltf
 import pytest
 import trimesh
-from commands import eslr
+from commands import eslr, succeeded
 from garment_files import stored
 from test_gltf import Player, make_body
 
@@ -325,7 +325,6 @@ def test_formats_that_are_unknown_and_garments_that_don_t_fit_are_refused(tmp_pa
 @pytest.mark.slow
 def test_the_command_exports_a_run(tmp_path, run):
     write_trajectory(tmp_path / "trajectory.npz", run)
-    result = eslr("export", tmp_path, "--out", tmp_path / "a.mdd")
-    assert result.returncode == 0, result.stderr
+    result = succeeded(eslr("export", tmp_path, "--out", tmp_path / "a.mdd"))
     assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
     assert (tmp_path / "a.mdd").stat().st_size == 8 + 4 * FRAMES + run.positions.nbytes

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import eslr, eslr_here, refused
+from commands import eslr, eslr_here, refused, succeeded
 from reference_models import make_scene, quick_jit
 from test_torch_archive import Tensor, write_archive
 
@@ -22,8 +22,7 @@ FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 
 def convert(checkpoint, out):
-    done = eslr_here("convert", checkpoint, "--out", out)
-    assert done.returncode == 0, done.stderr
+    succeeded(eslr_here("convert", checkpoint, "--out", out))
 
 
 @pytest.mark.parametrize("layout", ["postcvpr", "cvpr", "fine"])
@@ -71,8 +70,7 @@ def test_what_is_no_network_of_hoods_is_refused(tmp_path):
 def test_a_converted_network_simulates(tmp_path):
     convert(FIXTURES / "hood_postcvpr.pth", tmp_path / "hood.npz")
     words = ("--frames", 4, "--iterations", 20, "--no-pictures", "--out", tmp_path / "run")
-    done = eslr("simulate", "--model", tmp_path / "hood.npz", *words)
-    assert done.returncode == 0, done.stderr
+    succeeded(eslr("simulate", "--model", tmp_path / "hood.npz", *words))
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["finite"]
     assert report["max_principal_stretch"] < 2
