@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from broken import refuses
 
 from eslr_jax import AssetError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
@@ -80,9 +81,7 @@ def test_it_is_named_in_help_and_in_errors(run, monkeypatch, capsys):
 
 def test_whatever_its_reader_raises_is_one_named_line(tmp_path):
     (tmp_path / "a.rows").write_text("nonsense\n")
-    with pytest.raises(AssetError, match=r"file .*a\.rows can't be read") as caught:
-        read_mesh_file(tmp_path / "a.rows")
-    assert "\n" not in str(caught.value)
+    refuses(read_mesh_file, tmp_path / "a.rows", "a.rows can't be read")
 
 
 # --- the bundled formats of bodies and motions --------------------------------------------------------------

@@ -121,7 +121,7 @@ SIMULATE = {
     "--joint-map wing.json --motion good.bvh": "Wing", "--arm-abduction nan": "", "--arm-abduction 1e9": "",
     "--body-fps 30": "--body-fps", "--betas " + "1 " * 99: "betas", "--body-units cm": "metres",
     "--resume": "no interrupted simulation", "--resume --out damaged": "unfinished.npz",
-    "--out key.toml": "is a file", "--frames 2 --out key.toml/out": "key.toml",
+    "--frames 2 --settle 0 --iterations 1 --contact fast --out key.toml": "is a file",
 }  # fmt: skip
 TRAIN = {
     "": "--out", "--out t": "--config", "--config missing.toml --out t": "missing.toml",
