@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 from commands import eslr, refused, simulated, succeeded
-from peers import SCORE, describe_rollout, make_scene
 
 from eslr_jax.pose.lbs import skin_garment
 
@@ -71,6 +70,8 @@ def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
 
 @pytest.mark.slow
 def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_table(folder, carried, tshirt):
+    from peers import SCORE, describe_rollout, make_scene
+
     np.savez(folder / "carried.npz", positions=carried, faces=np.asarray(tshirt.faces))
     done = succeeded(eslr("score", folder / "carried.npz", "--motion", "cmu_016_32"))
     assert "optimality gap" in done.stdout
