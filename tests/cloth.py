@@ -33,6 +33,15 @@ def make_sheet(rows=5, columns=6, spacing=0.05, *, seed=0, jitter=0.2):
     return positions.reshape(-1, 3), grid_faces(rows, columns)
 
 
+def dented_sheets(dent: float):
+    """Return two level sheets 1 cm apart, the middle of the upper one pushed down by a depth [m], as a bowl."""
+    flat, faces = make_sheet(13, 13, 0.02, jitter=0.1)
+    flat = flat - flat.mean(axis=0)
+    upper = flat + np.array([0.003, 0.01, 0.004])
+    upper[:, 1] -= dent * np.exp(-np.sum(upper[:, [0, 2]] ** 2, axis=1) / (2 * 0.04**2))
+    return np.concatenate([flat, upper]), np.concatenate([faces, faces + len(flat)])
+
+
 def make_garment(positions, faces, *, is_pinned=None, sewn_positions=None) -> Garment:
     """Return a garment that one joint carries."""
     ones = np.ones((len(positions), 1))
@@ -78,19 +87,20 @@ def make_limb() -> Body:
     return jax.tree.map(jnp.asarray, limb)
 
 
+def shaped(body: Body, place) -> Body:
+    """Return a body whose rest pose is elsewhere: `place` maps its places [m]."""
+    fields = ("rest_positions", "joint_rest_positions")
+    return body.replace(**{name: np.float32(place(np.asarray(getattr(body, name)))) for name in fields})
+
+
 def stand_at(body: Body, offset) -> Body:
     """Return a body whose rest pose stands elsewhere, by an offset [m]."""
-    offset = np.asarray(offset, np.float32)
-    return body.replace(
-        rest_positions=np.asarray(body.rest_positions) + offset,
-        joint_rest_positions=np.asarray(body.joint_rest_positions) + offset,
-    )
+    return shaped(body, lambda places: places + np.float32(offset))
 
 
 def turn_about(body: Body, turn: np.ndarray) -> Body:
     """Return a body whose rest pose is turned about the origin: every place p is at p @ turn."""
-    fields = ("rest_positions", "joint_rest_positions")
-    return body.replace(**{name: np.asarray(getattr(body, name)) @ np.float32(turn) for name in fields})
+    return shaped(body, lambda places: places @ np.float32(turn))
 
 
 def swing_motion(body: Body, num_frames: int, *, sway: float = 0.02) -> Motion:

@@ -22,11 +22,10 @@ def ball(rings: int = 7, around: int = 12) -> tuple[np.ndarray, np.ndarray]:
         np.sin(polar)[:, None] * np.sin(angle), np.cos(polar)[:, None], np.sin(polar)[:, None] * np.cos(angle)
     ), axis=-1).reshape(-1, 3)  # fmt: skip
     positions = np.concatenate([ring, [[0, 1, 0]], [[0, -1, 0]]]) * RADIUS
-    first = np.arange(around)
-    last, after = first + (rings - 1) * around, np.roll(first, -1)
-    top = np.stack([np.full(around, len(positions) - 2), first, after], 1)
-    bottom = np.stack([np.full(around, len(positions) - 1), np.roll(last, -1), last], 1)
-    return positions, np.concatenate([grid_faces(rings, around, is_closed=True), top, bottom])
+    first, second = np.split(grid_faces(rings, around, is_closed=True), 2)
+    index, top = np.arange(rings * around).reshape(rings, around), np.full(around, len(positions) - 2)
+    caps = [top, index[0], np.roll(index[0], -1)], [top + 1, np.roll(index[-1], -1), index[-1]]
+    return positions, np.concatenate([second, first, *(np.stack(cap, 1) for cap in caps)])
 
 
 def square(side: int = 8, size: float = 0.24, *, is_pinned: np.ndarray | None = None) -> Garment:
@@ -38,7 +37,7 @@ def square(side: int = 8, size: float = 0.24, *, is_pinned: np.ndarray | None = 
     share = (x.ravel() / size + 0.5)[:, None]
     return prepare_garment(
         positions,
-        np.roll(grid_faces(side, side)[:, ::-1], 1, axis=1),  # tolerances know how these corners round
+        grid_faces(side, side)[:, [0, 2, 1]],
         skin_weights=np.concatenate([share, 1 - share], axis=1),
         skin_indices=np.broadcast_to([0, 1], (side * side, 2)),
         is_pinned=is_pinned,

@@ -12,6 +12,7 @@ from eslr_jax.pipeline.assets.catalog import find_asset
 from eslr_jax.pipeline.formats.garment import read_garment_npz
 from eslr_jax.pipeline.formats.obj import obj_text
 from eslr_jax.pipeline.rigs.rig import body_skeleton, skeleton_motion
+from eslr_jax.pose.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 
 SMPL_NAMES = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
@@ -36,6 +37,35 @@ Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 T_POSE_LEG = 0.835  # [m] of the person that stands in for a body of AMASS
 
 
+def animate(names, parents, rest, turned, root, fps=30.0):
+    """A moving skeleton with rigid bones, by its joints' turns since the rest pose and the root's path."""
+    skeleton = Skeleton(tuple(names), tuple(parents), np.asarray(rest))
+    return SkeletonMotion("a", skeleton, turned, chain_positions(turned, root, skeleton), fps)
+
+
+def moving(body, clip="cmu_016_32"):
+    """A bundled clip as the moving skeleton of a file."""
+    return skeleton_motion(load_motion(clip, body=body), body)
+
+
+def rigged(body, **changes):
+    """A body as the reader of a file returns it."""
+    mesh = RiggedMesh(
+        name="hero",
+        positions=np.asarray(body.rest_positions, np.float64),
+        faces=np.asarray(body.faces),
+        skin_weights=np.asarray(body.skin_weights, np.float64),
+        skin_indices=np.asarray(body.skin_indices),
+        skeleton=body_skeleton(body),
+    )
+    return dataclasses.replace(mesh, **changes)
+
+
+def posed_joints(motion, body):
+    """Where a motion puts the joints of a body [m], shape [frames, joints, 3]."""
+    return skeleton_motion(motion, body).positions
+
+
 def smpl_parameters(motion):
     """A motion on CMU joints as SMPL's: local rotations [frames, 24, 3] and the pelvis [frames, 3], Y up.
 
@@ -55,13 +85,9 @@ def smpl_parameters(motion):
             start = rest[place[SMPL_FROM_CMU[f"{side}_{word}"]]]
             bone = rest[place[side.capitalize() + ends[word]]] - start
             axis = np.array(along[word], float) * ([-1, 1, 1] if side == "right" else [1, 1, 1])
-            align = shortest_turn(axis, bone)
+            align = Rotation.align_vectors(bone, axis)[0].as_matrix()  # the shortest turn
         turned.append(motion.rotations[:, joint] @ align)
-    turned = np.stack(turned, axis=1)
-    local = turned.copy()
-    for joint, parent in enumerate(SMPL_PARENTS):
-        if parent >= 0:
-            local[:, joint] = np.swapaxes(turned[:, parent], 1, 2) @ turned[:, joint]
+    local = relative(np.stack(turned, axis=1), SMPL_PARENTS)
     leg = sum(
         np.linalg.norm(rest[place[b]] - rest[place[a]])
         for a, b in (("LeftUpLeg", "LeftLeg"), ("LeftLeg", "LeftFoot"))
@@ -70,12 +96,13 @@ def smpl_parameters(motion):
     return vectors, motion.positions[:, place["Hips"]] * T_POSE_LEG / leg
 
 
-def shortest_turn(start, end):
-    """The smallest rotation of one direction onto another, by its half vector."""
-    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
-    half = start + end
-    half /= np.linalg.norm(half)
-    return (2 * np.outer(half, half) - np.eye(3)) @ (2 * np.outer(start, start) - np.eye(3))
+def relative(turned, parents):
+    """Rotations [frames, joints, 3, 3] since the parents' from those in the world."""
+    local = turned.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            local[:, joint] = np.swapaxes(turned[:, parent], 1, 2) @ turned[:, joint]
+    return local
 
 
 def write_amass(path, rotations, pelvis, fps, num_joints=52):
@@ -114,6 +141,21 @@ def write_vto(path, rotations, pelvis):
     )
 
 
+def smpl_layout(positions, faces, weights, indices, joints, parents=SMPL_PARENTS):
+    """A body at rest [m] as the arrays of a SMPL file; weights and indices are of each vertex's influences."""
+    dense = np.zeros((len(positions), len(joints)))
+    np.add.at(dense, (np.arange(len(positions))[:, None], indices), weights)
+    tree = np.array([parents, np.arange(len(joints))], np.int64)
+    tree[0, 0] = 2**32 - 1  # as the files have it
+    return {
+        "v_template": np.asarray(positions, np.float64),
+        "f": np.asarray(faces).astype(np.uint32),
+        "weights": dense / dense.sum(axis=1, keepdims=True),
+        "J_regressor": joint_regressor(np.asarray(positions, np.float64), np.asarray(joints, np.float64)),
+        "kintree_table": tree,
+    }
+
+
 def smpl_model(body, rng):
     """A part of the bundled body on SMPL's 24 joints, as the arrays of a SMPL file, with random blend shapes."""
     names = list(body.joint_names)
@@ -122,51 +164,18 @@ def smpl_model(body, rng):
     merged = {ours: names.index(theirs) for ours, theirs in SMPL_FROM_CMU.items()}
     joints = np.asarray(body.joint_rest_positions, np.float64)[[merged[name] for name in SMPL_NAMES]]
     joints[22:] += joints[20:22] - joints[18:20]
-    positions = np.asarray(body.rest_positions, np.float64)[kept]
-    nearest = {}
-    for joint, name in enumerate(names):
+    nearest = []
+    for name in names:
         while name not in SMPL_FROM_CMU.values():
             name = names[body.parents[names.index(name)]]
-        nearest[joint] = next(k for k, smpl in enumerate(SMPL_NAMES) if SMPL_FROM_CMU[smpl] == name)
-    weights = np.zeros((len(positions), 24))
-    rows = np.repeat(np.arange(len(positions)), body.skin_indices.shape[1])
-    columns = [nearest[joint] for joint in np.asarray(body.skin_indices)[kept].ravel()]
-    np.add.at(weights, (rows, columns), np.asarray(body.skin_weights, np.float64)[kept].ravel())
-    tree = np.array([SMPL_PARENTS, np.arange(24)], np.int64)
-    tree[0, 0] = 2**32 - 1  # as the files have it
-    return {
-        "v_template": positions,
-        "f": faces.reshape(-1, 3).astype(np.uint32),
-        "weights": weights / weights.sum(axis=1, keepdims=True),
-        "J_regressor": joint_regressor(positions, joints),
-        "kintree_table": tree,
+        nearest.append(next(k for k, smpl in enumerate(SMPL_NAMES) if SMPL_FROM_CMU[smpl] == name))
+    positions, weights, indices = (
+        np.asarray(part)[kept] for part in (body.rest_positions, body.skin_weights, body.skin_indices)
+    )
+    return smpl_layout(positions, faces.reshape(-1, 3), weights, np.array(nearest)[indices], joints) | {
         "shapedirs": rng.normal(0.0, 0.01, (len(positions), 3, 10)),
         "posedirs": rng.normal(0.0, 0.002, (len(positions), 3, 207)),
     }
-
-
-def write_smpl(path, mesh):
-    """Write a body on SMPL's 24 joints as a SMPL file, without blend shapes.
-
-    Args:
-        path: The pickle.
-        mesh: A RiggedMesh, its joints in SMPL's order.
-    """
-    count = len(mesh.positions)
-    weights = np.zeros((count, 24))
-    np.add.at(weights, (np.arange(count)[:, None], mesh.skin_indices), mesh.skin_weights)
-    tree = np.array([mesh.skeleton.parents, np.arange(24)], np.int64)
-    tree[0, 0] = 2**32 - 1
-    values = {
-        "v_template": mesh.positions,
-        "f": mesh.faces.astype(np.uint32),
-        "weights": weights,
-        "J_regressor": joint_regressor(mesh.positions, mesh.skeleton.rest_positions),
-        "kintree_table": tree,
-        "shapedirs": np.zeros((count, 3, 10)),
-        "posedirs": np.zeros((count, 3, 207)),
-    }
-    path.write_bytes(pickle.dumps(values, protocol=2))
 
 
 def joint_regressor(positions, joints):
@@ -311,11 +320,7 @@ def write_bvh(path, motion, *, names=None, unit=1.0, axes=None, order="ZXY"):
     axes = np.eye(3) if axes is None else axes
     skeleton, names = motion.skeleton, names or list(motion.skeleton.joint_names)
     rest = unit * skeleton.rest_positions @ axes.T
-    turned = axes @ motion.rotations @ axes.T
-    local = turned.copy()
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            local[:, joint] = np.swapaxes(turned[:, parent], 1, 2) @ turned[:, joint]
+    local = relative(axes @ motion.rotations @ axes.T, skeleton.parents)
     lines, columns = ["HIERARCHY"], []
 
     def visit(joint, depth):
@@ -360,7 +365,7 @@ def write_walker(character, shirt, body, *, size=1.0, start_poses=0):
         size: Factor on all lengths of the character.
         start_poses: Frames of its rest pose before the walk, from which it jumps.
     """
-    motion = skeleton_motion(load_motion(), body)
+    motion = moving(body)
     skeleton = body_skeleton(body)
     skeleton = dataclasses.replace(skeleton, rest_positions=size * skeleton.rest_positions)
     turns = np.concatenate([np.tile(np.eye(3), (start_poses, len(skeleton), 1, 1)), motion.rotations[:8]])

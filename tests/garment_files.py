@@ -17,8 +17,24 @@ def bundled(name: str) -> GarmentFile:
     return read_garment_npz(find_asset("garment", name))
 
 
+def stored(positions: np.ndarray, faces: np.ndarray, **fields) -> GarmentFile:
+    """Return a garment that one joint carries."""
+    one = np.ones((len(positions), 1))
+    skin = {"skin_weights": one, "skin_indices": np.zeros_like(one, int), "is_pinned": one[:, 0] > 1}
+    return GarmentFile(positions, faces, **skin | fields)
+
+
 def source(positions: np.ndarray, faces: np.ndarray, **fields) -> MeshFile:
     return MeshFile(positions, faces, name="test", **fields)
+
+
+def cut_apart(positions: np.ndarray, faces: np.ndarray, is_moved: np.ndarray, shift) -> tuple:
+    """Return a mesh whose chosen faces have vertices of their own, moved by a shift [m]."""
+    parts = [np.unique(faces[chosen], return_inverse=True) for chosen in (~is_moved, is_moved)]
+    (kept, first), (moved, second) = ((used, local.reshape(-1, 3)) for used, local in parts)
+    return np.concatenate([positions[kept], positions[moved] + shift]), np.concatenate(
+        [first, second + len(kept)]
+    )
 
 
 def dent(garment: GarmentFile, body, depth: float) -> tuple[np.ndarray, int]:

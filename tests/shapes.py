@@ -12,7 +12,6 @@ KERNELS = [
     "eslr_jax.pose.lbs",
     "eslr_jax.contact",
     "eslr_jax.networks",
-    "eslr_jax.networks",
     "eslr_jax.solver",
     "eslr_jax.terms",
     "eslr_jax.simulation.scene",

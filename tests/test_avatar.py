@@ -4,29 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from commands import eslr
-from foreign_files import write_smpl, write_walker
+from commands import eslr, simulated, succeeded
+from foreign_files import write_walker
 from garment_shapes import write_obj
-from other_bodies import smpl_female
 
 from eslr_jax import load_garment, load_motion, load_trajectory, pose_body, prepare_scene
 
-
-def done(*arguments):
-    """Return what a command that succeeds prints, and what it says beside."""
-    result = eslr(*arguments)
-    assert result.returncode == 0, result.stderr
-    return result.stdout, result.stderr
-
-
-def simulate(out, *arguments, frames=3, iterations=20):
-    """Return the report of a simulation and what is said beside it."""
-    length = () if frames is None else ("--frames", frames)
-    words = ("--simulator", "physics", *length, "--iterations", iterations, "--no-pictures", "--json")
-    printed, said = done("simulate", *arguments, *words, "--out", out)
-    report = json.loads(printed)
-    assert report["finite"]
-    return report, said
+SHORT = ("--frames", 4, "--iterations", 20)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +24,8 @@ def avatar(tmp_path_factory, body):
 @pytest.mark.slow
 def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body):
     out = tmp_path / "out"
-    report, _ = simulate(out, "--body", avatar / "avatar.glb", "--garment", avatar / "shirt.obj", frames=4)
+    words = ("--body", avatar / "avatar.glb", "--garment", avatar / "shirt.obj", *SHORT)
+    report, _ = simulated(out, *words)
     assert report["motion"].endswith("avatar.glb")  # its own animation
     run = load_trajectory(out)
     assert run.positions.shape == (4, 1000, 3)
@@ -48,30 +33,30 @@ def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body)
     distance = np.linalg.norm(run.body.positions - np.asarray(expected.positions), axis=-1)
     assert np.quantile(distance, 0.99) < 2e-3  # [m]: glTF kept four of up to seven influences
     assert distance.max() < 0.015
-    done("export", out, "--out", tmp_path / "shirt.pc2")
+    succeeded(eslr("export", out, "--out", tmp_path / "shirt.pc2"))
 
 
 @pytest.mark.slow
 def test_a_skipped_start_pose_is_in_the_report_and_said_with_a_point_cache(tmp_path, body):
     character, out = tmp_path / "avatar.glb", tmp_path / "out"
     write_walker(character, tmp_path / "shirt.obj", body, start_poses=2)
-    report, _ = simulate(out, "--body", character, "--settle", 0, iterations=5)
+    report, _ = simulated(out, "--body", character, "--settle", 0, "--frames", 3, "--iterations", 5)
     skipped = 2 / load_motion().fps
     assert report["motion_start_s"] == pytest.approx(skipped, rel=1e-3)
-    printed, said = done("export", out, "--out", tmp_path / "shirt.pc2")
-    assert printed.strip() == str(tmp_path / "shirt.pc2")
-    assert f"is {skipped:.3f} s after the first frame of the animation" in " ".join(said.split())
+    done = succeeded(eslr("export", out, "--out", tmp_path / "shirt.pc2"))
+    assert done.stdout.strip() == str(tmp_path / "shirt.pc2")
+    assert f"is {skipped:.3f} s after the first frame of the animation" in " ".join(done.stderr.split())
 
 
 @pytest.mark.slow
 def test_a_bundled_garment_is_carried_to_a_new_character_with_a_line_that_says_so(avatar, tmp_path):
-    report, said = simulate(tmp_path / "out", "--body", avatar / "avatar.glb", frames=4)
+    report, said = simulated(tmp_path / "out", "--body", avatar / "avatar.glb", *SHORT)
     assert report["penetration_max_mm"] < 1.0
     (line,) = [line for line in said.splitlines() if line.startswith("tshirt carried to ")]
     assert "cut anew for it; its girth is 1.00 and its length 1.00" in line  # it is the bundled body, renamed
     words = ("--scale", "none", "--out", tmp_path / "kept.npz", "--no-picture", "--json")
-    printed, _ = done("fit", "tank", "--body", avatar / "avatar.glb", *words)
-    assert json.loads(printed)["scale"] == "none"
+    done = succeeded(eslr("fit", "tank", "--body", avatar / "avatar.glb", *words))
+    assert json.loads(done.stdout)["scale"] == "none"
     assert (tmp_path / "kept.npz").exists()
 
 
@@ -83,48 +68,6 @@ def test_a_mesh_in_motion_is_a_body(tmp_path, walk):
     shirt = load_garment("tshirt")
     start = np.asarray(prepare_scene(shirt, walk).initial_state.position)
     write_obj(garment, (start, np.asarray(shirt.faces)))
-    simulate(out, "--body", moving, "--garment", garment, frames=None)
+    simulated(out, "--body", moving, "--garment", garment, "--iterations", 20)
     run = load_trajectory(out)
     np.testing.assert_allclose(run.body.positions, walk.positions[:5], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_what_contradicts_is_refused_in_one_line(tmp_path):
-    moving, out = tmp_path / "body.npz", tmp_path / "out"
-    np.savez(moving, positions=np.zeros((2, 3, 3)), faces=np.array([[0, 1, 2]]))
-    result = eslr("simulate", "--body", moving, "--motion", "turn", "--frames", 2, "--out", out)
-    assert result.returncode == 2, result.stderr
-    (line,) = [line for line in result.stderr.splitlines() if line.startswith("eslr: ")]
-    assert "follows no other" in line
-    assert not out.exists(), "what is refused leaves no folder"
-
-
-def test_the_joint_map_is_printed_and_written(avatar, tmp_path):
-    path = tmp_path / "map.json"
-    printed, _ = done("joints", "--body", "anny", "--motion", avatar / "avatar.glb", "--out", path, "--json")
-    found = json.loads(printed)
-    assert json.loads(path.read_text()) == found
-    assert found["LeftArm"] == "mixamorig:LeftArm"
-    assert found["Spine1"] == "mixamorig:Spine2"
-
-
-@pytest.mark.slow
-def test_a_character_of_200_m_is_scaled_with_a_line_and_wears_a_bundled_garment(tmp_path, body):
-    write_walker(tmp_path / "giant.glb", tmp_path / "shirt.obj", body, size=118.0)
-    report, said = simulate(tmp_path / "out", "--body", tmp_path / "giant.glb")
-    assert "taken to be in cm" in said
-    assert report["motion"].endswith("giant.glb")
-    run = load_trajectory(tmp_path / "out")
-    assert 1.5 < np.ptp(run.body.positions[-1][:, 1]) < 2.2
-    assert report["max_principal_stretch"] < 2.0
-    assert report["penetration_max_mm"] < 1.0
-
-
-@pytest.mark.slow
-def test_the_default_shirt_is_carried_to_a_smpl_file(tmp_path):
-    write_smpl(tmp_path / "smpl.pkl", smpl_female())
-    report, said = simulate(tmp_path / "out", "--body", tmp_path / "smpl.pkl")
-    assert report["garment"] == "tshirt"
-    assert report["max_principal_stretch"] < 2.0
-    assert report["penetration_max_mm"] < 1.0
-    assert "tshirt carried to " in said

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from commands import refused, succeeded
 
 # Packages of the extras, and of the development environment.
 EXTRAS = (
@@ -36,15 +37,13 @@ def eslr(*arguments: str) -> subprocess.CompletedProcess:
 
 
 def test_every_public_name_loads_without_extras():
-    done = run("import eslr_jax; print([getattr(eslr_jax, name) for name in eslr_jax.__all__])")
-    assert done.returncode == 0, done.stderr
-    assert "rollout" in done.stdout
+    code = "import eslr_jax; print([getattr(eslr_jax, name) for name in eslr_jax.__all__])"
+    assert "rollout" in succeeded(run(code)).stdout
 
 
 @pytest.mark.slow
 def test_simulate_works_without_extras(tmp_path):
-    done = eslr(*SHORT, "--no-pictures", "--json", "--out", str(tmp_path))
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr(*SHORT, "--no-pictures", "--json", "--out", str(tmp_path)))
     report = json.loads(done.stdout)
     assert report["finite"]
     assert report["num_frames"] == 5
@@ -57,16 +56,10 @@ def test_simulate_works_without_extras(tmp_path):
 @pytest.mark.slow
 def test_a_missing_extra_is_named_in_one_line(tmp_path):
     """Pictures are part of a run that goes on without them; a command that makes nothing else ends."""
-    done = eslr(*SHORT, "--out", str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    lines = [line for line in done.stderr.splitlines() if "eslr-jax[" in line]
-    assert len(lines) == 1
-    assert (
-        'no pictures: this needs mitsuba, which is not installed: pip install "eslr-jax[render]"' in lines[0]
-    )
+    extra = 'this needs mitsuba, which is not installed: pip install "eslr-jax[render]"'
+    done = succeeded(eslr(*SHORT, "--out", str(tmp_path)))
+    (line,) = [line for line in done.stderr.splitlines() if "eslr-jax[" in line]
+    assert f"no pictures: {extra}" in line
     assert "Traceback" not in done.stderr
     assert (tmp_path / "trajectory.npz").exists()
-    film = eslr("render", str(tmp_path), "--out", str(tmp_path / "sheet.png"))
-    assert film.returncode == 2
-    assert film.stderr.splitlines()[-1].endswith('pip install "eslr-jax[render]"')
-    assert "Traceback" not in film.stderr
+    refused(eslr("render", str(tmp_path), "--out", str(tmp_path / "sheet.png")), extra)

@@ -11,29 +11,25 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import eslr, eslr_here, refused
-from foreign_files import smpl_model, write_amass, write_bvh
+from commands import eslr, eslr_here, refused, simulated, succeeded
+from foreign_files import moving, smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 from own_term import Push
 
-from eslr_jax import ConfigError, load_body, load_motion
+from eslr_jax import ConfigError, MotionError, load_body, load_motion, pose_body
 from eslr_jax.config import from_dict
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.cli.console import use_compile_cache
 from eslr_jax.pipeline.cli.method import choose_method
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.garment import read_garment_npz
-from eslr_jax.pipeline.rigs.rig import skeleton_motion
 from eslr_jax.terms import Contact
 
 
 @pytest.mark.slow
 def test_simulate_writes_everything(tmp_path):
-    result = eslr(
-        "simulate", "--simulator", "physics", "--frames", 4, "--iterations", 20, "--out", tmp_path, "--json"
-    )
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
+    words = ("--simulator", "physics", "--frames", 4, "--iterations", 20, "--json")
+    report = json.loads(succeeded(eslr("simulate", *words, "--out", tmp_path)).stdout)
     for key in (
         "finite", "num_frames", "num_vertices", "terms", "total", "max_principal_stretch",
         "penetration_p999_mm", "penetration_max_mm", "penetrating_share", "frame_ms", "compile_s", "device",
@@ -75,13 +71,10 @@ def test_a_term_that_can_not_be_made_is_refused_in_one_line(text, reason):
 @pytest.mark.slow
 def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled there yet
-    words = ("simulate", "--simulator", "physics", "--iterations", 20, "--frames", 4, "--no-pictures")
-    reports = []
-    for _ in range(2):
-        result = eslr(*words, "--json", "--out", tmp_path / "run")
-        assert result.returncode == 0, result.stderr
-        reports.append((json.loads(result.stdout)["compile_s"], result.stderr))
-    (first, told), (second, untold) = reports
+    (one, told), (other, untold) = (
+        simulated(tmp_path / "run", "--iterations", 20, "--frames", 4) for _ in range(2)
+    )
+    first, second = one["compile_s"], other["compile_s"]
     assert first > 5
     assert f"waited {first:.0f} s for the compiler" in told
     assert second < 0.5 * first
@@ -89,16 +82,23 @@ def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("iterations", "integrator"), [(0, "euler"), (5, "bdf2")])
-def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
-    tmp_path, iterations, integrator
+@pytest.mark.parametrize(
+    ("options", "integrator", "method"),
+    [
+        (("--iterations", 0), "euler", "smooth-small"),
+        ((), "bdf2", "smooth-small, then 10 iterations of the solver"),
+    ],
+)
+def test_a_network_alone_steps_as_it_was_trained_and_iterations_that_are_added_are_announced(
+    tmp_path, options, integrator, method
 ):
-    options = ("--model", "smooth-small", "--iterations", iterations, "--frames", 3, "--no-pictures")
-    result = eslr("simulate", *options, "--out", tmp_path, "--json")
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
-    assert report["integrator"] == integrator
+    words = ("--model", "smooth-small", "--frames", 3, "--settle", 0, "--no-pictures", "--json")
+    done = succeeded(eslr("simulate", *words, *options, "--out", tmp_path))
+    report = json.loads(done.stdout)
+    assert (report["integrator"], report["model"]) == (integrator, method)
     assert report["finite"]
+    line = f"a frame is solved by {method}; --iterations 0 is the network alone"
+    assert done.stderr.splitlines().count(line) == (not options)
 
 
 def test_a_compile_cache_that_is_set_is_kept(monkeypatch, tmp_path):
@@ -158,10 +158,19 @@ def test_commands_silence_the_log_of_xla_before_jax_reads_the_setting():
     assert found.stdout.split()[-1] == "3"
 
 
-def test_assets_lists_every_kind():
-    result = eslr_here("assets", "--json", "--verify")
-    kinds = {asset["kind"] for asset in json.loads(result.stdout)}
-    assert {"body", "garment", "motion", "fabric"} <= kinds
+def test_assets_lists_every_kind(body):
+    done = succeeded(eslr_here("assets", "--json", "--verify"))
+    listed = json.loads(done.stdout)
+    assert all(asset["source"] and (asset["kind"] == "fabric" or asset["licence"]) for asset in listed)
+    assert {"body", "garment", "motion", "fabric"} <= {asset["kind"] for asset in listed}
+    (clip,) = (asset for asset in listed if asset["name"] == "cmu_016_22")
+    poses = pose_body(body, load_motion("cmu_016_22"), num_frames=clip["frames"])
+    assert len(poses.positions) == clip["frames"]
+    with pytest.raises(MotionError, match="fewer than"):
+        pose_body(body, load_motion("cmu_016_22"), num_frames=clip["frames"] + 1)
+    fabrics = json.loads(eslr_here("assets", "--kind", "fabric", "--json").stdout)
+    assert all(fabric["source"] and fabric["density"] > 0 for fabric in fabrics.values())
+    assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
 
 
 def test_what_runs_keep_is_shown_and_removed(tmp_path, monkeypatch):
@@ -193,8 +202,7 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
     from eslr_jax.pipeline.assets.catalog import find_asset
 
     def shown(model):
-        done = eslr_here("info", "--model", model, "--json")
-        assert done.returncode == 0, done.stderr
+        done = succeeded(eslr_here("info", "--model", model, "--json"))
         return json.loads(done.stdout)
 
     assert shown("eslr-small")["config"]["refinement_steps"] == 14  # also an architecture, of twelve steps
@@ -208,19 +216,11 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
     assert shown("mine")["model"] == "mine"
 
 
-def test_fabrics_are_listed_with_their_sources():
-    fabrics = json.loads(eslr_here("assets", "--kind", "fabric", "--json").stdout)
-    assert {"cotton", "denim", "silk"} <= set(fabrics)
-    assert all(fabric["source"] and fabric["density"] > 0 for fabric in fabrics.values())
-    assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
-
-
 @pytest.mark.slow
 def test_scanned_shirt_to_a_stable_simulation_in_one_command(tmp_path, body):
     """An OBJ with seams, in centimetres, Z up, 5 mm inside the body: no option but the file."""
     scan = scanned_tshirt(tmp_path / "shirt.obj", body)
-    result = eslr("simulate", "--garment", scan, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = succeeded(eslr("simulate", "--garment", scan, cwd=tmp_path))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["finite"]
     assert report["num_frames"] > 100
@@ -234,17 +234,12 @@ def test_fit_writes_a_garment_and_a_picture(tmp_path, body):
     scan = scanned_tshirt(tmp_path / "shirt.obj", body)
     options = ("--pin", "loop:top", "--fabric", "silk", "front:denim", "--json")
     (tmp_path / "fitted.png").write_bytes(b"texture")
-    result = eslr("fit", scan, "--out", tmp_path / "fitted.npz", *options)
-    assert result.returncode == 0, result.stderr
+    result = succeeded(eslr("fit", scan, "--out", tmp_path / "fitted.npz", *options))
     assert (tmp_path / "fitted.png").read_bytes() == b"texture"
     assert json.loads(result.stdout)["pinned"] > 10
     assert (tmp_path / "fitted_fit.png").stat().st_size > 10_000
-    run = ("--simulator", "physics", "--frames", 4, "--no-pictures", "--json", "--out", tmp_path / "run")
-    result = eslr("simulate", "--garment", tmp_path / "fitted.npz", *run)
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
+    report, _ = simulated(tmp_path / "run", "--garment", tmp_path / "fitted.npz", "--frames", 4)
     assert report["fabric"] == ["silk", "front:denim"]
-    assert report["finite"]
     assert (tmp_path / "run" / "garment.npz").exists()
 
 
@@ -306,20 +301,8 @@ def test_a_budget_buys_iterations_of_the_solver_and_of_a_network():
     assert alone.pace(alone.config.iterations, 1e3) == 5
 
 
-@pytest.mark.slow
-def test_iterations_that_are_added_to_a_network_are_announced(tmp_path):
-    words = ("--frames", 3, "--settle", 0, "--no-pictures", "--json", "--out", tmp_path)
-    done = eslr("simulate", "--model", "smooth-small", *words)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["model"] == "smooth-small, then 10 iterations of the solver"
-    assert report["iterations_mean"] == 10
-    line = f"a frame is solved by {report['model']}; --iterations 0 is the network alone"
-    assert done.stderr.splitlines().count(line) == 1
-
-
-def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path):
-    walk = skeleton_motion(load_motion("cmu_016_32"), load_body())
+def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, body):
+    walk = moving(body)
     bones = [f"Bone.{number:03}" for number in range(len(walk.skeleton.joint_names))]
     write_bvh(tmp_path / "a.bvh", walk, names=bones)
     done = eslr_here("joints", "--motion", tmp_path / "a.bvh", "--out", tmp_path / "map.json")

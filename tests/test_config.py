@@ -1,20 +1,21 @@
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import pytest
-from commands import eslr_here
+from commands import eslr_here, succeeded
 
-from eslr_jax import ConfigError, SimConfig, TrainConfig
-from eslr_jax.config import apply_overrides, from_dict, parse_override
-from eslr_jax.networks.eslr import Eslr
+from eslr_jax import ConfigError, TrainConfig
+from eslr_jax.config import apply_overrides, parse_override
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.training.recipe import describe_train_config, load_recipe, read_train_config
 
+RECIPES = Path(__file__).parents[1] / "experiments" / "configs"
+
 
 def test_train_shows_what_every_key_is():
-    done = eslr_here("train", "--keys")
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr_here("train", "--keys"))
     shown = " ".join(done.stdout.replace("│", " ").split())
     kinds = {type(model) for model in MODELS.values()}
     parts = shown.split("usage: eslr train --keys")
@@ -30,16 +31,6 @@ def test_train_shows_what_every_key_is():
             )
             assert says, name
             assert says[1], name
-
-
-def test_unknown_key_suggests_the_closest():
-    with pytest.raises(ConfigError, match="did you mean iterations"):
-        from_dict(SimConfig, {"iterationz": 3})
-
-
-def test_configs_are_hashable_static_arguments():
-    assert hash(SimConfig(iterations=3)) == hash(SimConfig(iterations=3))
-    assert hash(Eslr()) == hash(Eslr())
 
 
 def test_overrides_reach_into_tables():
@@ -100,9 +91,7 @@ def test_a_gradient_sees_the_collision_stiffness_beside_any_set_of_energies():
 
 
 def test_shipped_recipes_load():
-    from pathlib import Path
-
-    recipes = sorted((Path(__file__).parents[1] / "experiments" / "configs").rglob("*.toml"))
+    recipes = sorted(RECIPES.rglob("*.toml"))
     assert recipes
     for recipe in recipes:
         load_recipe(recipe)
@@ -110,9 +99,7 @@ def test_shipped_recipes_load():
 
 def test_the_papers_networks_have_a_recipe_each():
     """They differ in the network alone."""
-    from pathlib import Path
-
-    folder = Path(__file__).parents[1] / "experiments" / "configs" / "paper"
+    folder = RECIPES / "paper"
     shared = load_recipe(folder / "full-size.toml")
     for name in ("eslr-15", "eslr-10", "lsdmp-15", "gsa-15", "mgn-15", "mgn-48", "hood"):
         assert load_recipe(folder / f"{name}.toml") == dataclasses.replace(shared, model=MODELS[name])

@@ -1,9 +1,7 @@
 """The commands, snippets and links of the documentation work."""
 
 import ast
-import contextlib
 import importlib
-import io
 import json
 import os
 import re
@@ -16,10 +14,12 @@ from pathlib import Path
 
 import jax
 import pytest
+from commands import eslr_here
 from foreign_files import write_walker
 from garment_files import scanned_tshirt
 
 ROOT = Path(__file__).parents[1]
+ESLR = [sys.executable, "-m", "eslr_jax.pipeline.cli"]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # Commands of ```bash blocks are run as written, with these options to save time:
 SHORTER = {
@@ -65,12 +65,7 @@ def name(value):
 
 def help_text(*command):
     """Return what `eslr COMMAND --help` prints, in one line."""
-    from eslr_jax.pipeline.cli import app
-
-    stream = io.StringIO()
-    with contextlib.redirect_stdout(stream), contextlib.suppress(SystemExit):
-        app.cli(prog="eslr", args=[*command, "--help"])
-    return " ".join(stream.getvalue().split())
+    return " ".join(eslr_here(*command, "--help").stdout.split())
 
 
 def test_guides_show_every_command():
@@ -144,29 +139,17 @@ def workplace(tmp_path_factory, body):
 @pytest.mark.example
 @pytest.mark.parametrize(("page", "words"), RUN, ids=name)
 def test_documented_commands_run(workplace, page, words):
-    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *shorter(words)[1:]]
+    command = [*ESLR, *shorter(words)[1:]]
     result = subprocess.run(command, cwd=workplace, capture_output=True, text=True, timeout=900, check=False)
     assert result.returncode == 0, f"{page.name}: {' '.join(words)}\n{result.stderr}"
 
 
-ESLR = [sys.executable, "-m", "eslr_jax.pipeline.cli"]
-
-
 def simulate_missing(folder, runs):
     """Simulate the runs that a snippet reads, whatever was simulated before it."""
-    simulate = [
-        sys.executable,
-        "-m",
-        "eslr_jax.pipeline.cli",
-        "simulate",
-        "--frames",
-        "3",
-        "--no-pictures",
-        "--out",
-    ]
     for run in runs:
         if not (folder / run).exists():
-            subprocess.run([*simulate, run], cwd=folder, capture_output=True, timeout=900, check=True)
+            command = [*ESLR, "simulate", "--frames", "3", "--no-pictures", "--out", run]
+            subprocess.run(command, cwd=folder, capture_output=True, timeout=900, check=True)
 
 
 @pytest.mark.slow
@@ -175,13 +158,11 @@ def simulate_missing(folder, runs):
 def test_documented_views_serve_a_page(workplace, page, words):
     pytest.importorskip("viser")
     simulate_missing(workplace, words[2:])
-    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *words[1:]]
-    with subprocess.Popen(command, cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen([*ESLR, *words[1:]], cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         try:
-            address = next(
-                line.strip() for line in server.stdout if line.startswith("http")
-            )  # under viser's own
+            # Under viser's own.
+            address = next(line.strip() for line in server.stdout if line.startswith("http"))
             with urllib.request.urlopen(address, timeout=60) as reply:
                 assert reply.status == 200
         finally:

@@ -9,7 +9,7 @@ import pytest
 from garment_files import bundled
 
 from eslr_jax import ConfigError, pose_body, prepare_scene, prepare_scenes
-from eslr_jax.fabric.materials import COTTON, FABRICS, WOVEN, fabric_material, fabric_names
+from eslr_jax.fabric.materials import COTTON, FABRICS, WOVEN, fabric_material
 from eslr_jax.fabric.validate import validate_material
 from eslr_jax.numerics import gather_corners
 from eslr_jax.pipeline.assets import prepare_stored
@@ -26,16 +26,6 @@ def two_fabrics():
     side = (stored.rest_positions[stored.faces].mean(axis=1)[:, 0] > 0).astype(int)
     stored = dataclasses.replace(stored, face_parts=side, part_names=("right", "left"))
     return stored, prepare_stored(stored)
-
-
-def test_every_fabric_has_a_source_and_plausible_values():
-    assert {"cotton", "denim", "silk"} <= set(fabric_names())
-    for name in fabric_names():
-        material = fabric_material(name)
-        assert 0.02 < material.density < 0.7
-        assert 1e-6 < material.bending_stiffness < 1e-3
-        assert 0 < material.lame_mu * material.thickness < 5e3
-    assert all(fabric.source for fabric in FABRICS.values())
 
 
 @pytest.mark.parametrize("name", list(FABRICS))
@@ -113,13 +103,6 @@ def test_what_networks_have_not_seen_is_named():
     assert beyond_training(COTTON.replace(thickness=np.float32(2e-3))) == ("lame_mu", "lame_lambda")
     assert beyond_training(COTTON.replace(density=np.float32(3.0))) == ("density",)
     assert beyond_training(COTTON.replace(bending_stiffness=np.float32(1e-9))) == ("bending_stiffness",)
-
-
-def test_fabric_of_the_file_is_the_default(two_fabrics):
-    stored, garment = two_fabrics
-    stored = dataclasses.replace(stored, metadata={"fabrics": ["satin"]})
-    assert garment_material((), garment, stored).density == fabric_material("satin").density
-    assert garment_material(("denim",), garment, stored).density == fabric_material("denim").density
 
 
 @pytest.mark.parametrize(("text", "named"), [

@@ -60,6 +60,15 @@ class Player:
             self.wait(1)
         return self.positions()
 
+    def record(self, count):
+        """Begin to record, and wait for so many frames."""
+        self.live.controls["record"].value = True
+        self.until(lambda: len(self.live.recorded) >= count)
+
+    def newest_run(self):
+        """Return the recording that was written last."""
+        return read_run(max(self.live.out.iterdir(), key=lambda folder: int(folder.name)))
+
 
 @pytest.fixture(scope="module")
 def player(tmp_path_factory):
@@ -68,8 +77,7 @@ def player(tmp_path_factory):
     player.wait(5)
     yield player
     runs = len(list(player.live.out.iterdir()))
-    player.live.controls["record"].value = True
-    player.until(lambda: len(player.live.recorded) >= 3)
+    player.record(3)
     player.end.set()
     player.thread.join(timeout=60)
     assert len(list(player.live.out.iterdir())) == runs + 1, "the end of the page ends a recording"
@@ -153,20 +161,15 @@ def test_a_vertex_is_dragged_and_let_go(player):
     player.wait(2)
 
 
-def newest_run(live):
-    """Return the recording that was written last."""
-    return read_run(max(live.out.iterdir(), key=lambda folder: int(folder.name)))
-
-
 def test_a_recording_is_a_run(player):
-    player.live.controls["fabric"].value = "denim"  # its contacts are stiffer than those of cotton, the first
+    controls = player.live.controls
+    controls["fabric"].value = "denim"  # its contacts are stiffer than those of cotton, the first
     player.wait(3)
-    player.live.controls["record"].value = True
-    player.wait(6)
-    player.live.controls["record"].value = False
+    player.record(6)
+    controls["record"].value = False
     player.wait(3)
-    player.live.controls["fabric"].value = "cotton"
-    run = newest_run(player.live)
+    controls["fabric"].value = "cotton"
+    run = player.newest_run()
     assert 6 <= run.trajectory.num_frames <= 8
     assert run.report["motion"] == "turn"
     assert [term.name for term in run.scene.terms][-1] == "air", "no hand"
@@ -176,61 +179,47 @@ def test_a_recording_is_a_run(player):
 
 
 def test_a_recording_that_a_hand_pulled_at_is_not_scored(player):
-    controls = player.live.controls
-    controls["record"].value = True
-    player.wait(2)
+    player.record(2)
     take_hold(player.live, (0.0, 1.1, 3.0), (0.0, 0.0, -1.0))
     player.wait(3)
-    controls["record"].value = False
+    player.live.controls["record"].value = False
     player.wait(2)
     let_go(player.live)
-    run = newest_run(player.live)
+    run = player.newest_run()
     assert run.trajectory.num_frames > 3
     with pytest.raises(AssetError, match="a hand held the cloth"):
         run_trajectory(run)
 
 
-def test_a_minute_is_recorded_at_most(player, monkeypatch):
-    monkeypatch.setattr("eslr_jax.pipeline.page.live.MOST_RECORDED", 4)
-    player.live.controls["record"].value = True
-    player.until(lambda: not player.live.controls["record"].value)
-    player.wait(1)
-    assert newest_run(player.live).trajectory.num_frames == 4
-
-
-def test_a_recording_ends_with_the_fabric_wind_and_garment_that_it_shows(player):
+def test_a_recording_ends_after_a_minute_and_with_what_it_shows(player, monkeypatch):
     live, controls = player.live, player.live.controls
 
-    def change(control, value):
-        controls["record"].value = True
-        player.until(lambda: len(live.recorded) >= 3)
-        control.value = value
+    def ended_by(change, undo=lambda: None):
+        player.record(3)
+        change()
         player.until(lambda: not controls["record"].value and not live.recorded)
+        undo()
+        player.wait(1)
+        run = player.newest_run()
+        assert run.trajectory.num_frames >= 3
+        return run
 
-    change(controls["wind"], 5.0)
-    player.wait(1)
-    assert newest_run(live).report["wind_m_s"] == [0.0, 0.0, 0.0]
-    change(controls["fabric"], "denim")
-    player.wait(1)
-    run = newest_run(live)
+    def set_control(control, value):
+        return lambda: setattr(control, "value", value)
+
+    with monkeypatch.context() as short:
+        short.setattr("eslr_jax.pipeline.page.live.MOST_RECORDED", 6)
+        assert ended_by(lambda: None).trajectory.num_frames == 6
+    ended_by(lambda: restart(live))
+    assert ended_by(set_control(controls["wind"], 5.0)).report["wind_m_s"] == [0.0, 0.0, 0.0]
+    run = ended_by(set_control(controls["fabric"], "denim"))
     assert run.report["wind_m_s"] == [0.0, 0.0, 5.0]
     np.testing.assert_allclose(run.scene.material.density, fabric_material("cotton").density, rtol=1e-6)
     np.testing.assert_allclose(run.scene.terms[-1].wind, [0.0, 0.0, 5.0])
-    change(controls["garments"][1], "tshirt")  # which does not load, over itself
-    controls["garments"][1].value = "nothing"
-    player.wait(1)
-    assert newest_run(live).trajectory.num_frames >= 3
+    second = controls["garments"][1]
+    ended_by(set_control(second, "tshirt"), set_control(second, "nothing"))  # it does not load, over itself
     controls["wind"].value, controls["fabric"].value = 0.0, "cotton"
-
-
-def test_a_recording_ends_where_the_garment_is_put_on_anew(player):
-    live, controls = player.live, player.live.controls
-    controls["record"].value = True
-    player.until(lambda: len(live.recorded) >= 3)
-    restart(live)
-    player.until(lambda: not controls["record"].value and not live.recorded)
     player.wait(1)
-    assert newest_run(live).trajectory.num_frames >= 3
 
 
 def test_what_does_not_load_is_said_and_the_choice_before_plays_on(player):
@@ -294,22 +283,6 @@ def page(player):
         assert not [text for text in page.errors if "favicon" not in text]
 
 
-def enter(page, label, value):
-    """Type a slider's value."""
-    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::div[contains(@class,'Flex-root')][1]")
-    field = row.locator("input[type=text]")
-    field.fill(str(value))
-    field.press("Enter")
-
-
-def choose(page, label, option):
-    """Choose an option of a dropdown."""
-    box = page.get_by_label(label, exact=True).first
-    box.click()
-    box.fill(option)  # the list shows what fits the text
-    page.get_by_role("option", name=option, exact=True).click()
-
-
 def pixel(player, canvas, point):
     """Return where on the page a point [m] is drawn."""
     (client,) = player.live.server.get_clients().values()
@@ -322,18 +295,6 @@ def pixel(player, canvas, point):
     scale = 0.5 * canvas["height"] / np.tan(0.5 * camera.fov) / (offset @ ahead)
     across, up = offset @ right * scale, offset @ np.cross(right, ahead) * scale
     return canvas["x"] + 0.5 * canvas["width"] + across, canvas["y"] + 0.5 * canvas["height"] - up
-
-
-def test_page_s_sliders_and_dropdowns_change_the_cloth(player, page):
-    controls, before = player.live.controls, player.forward()
-    enter(page, "speed, m/s", 10)
-    player.until(lambda: controls["wind"].value == 10 and player.forward() > before + 0.003, seconds=240)
-    enter(page, "speed, m/s", 0)
-    player.until(lambda: controls["wind"].value == 0, seconds=240)
-    choose(page, "fabric", "denim")
-    player.until(lambda: controls["fabric"].value == "denim", seconds=240)
-    choose(page, "fabric", "cotton")
-    player.until(lambda: controls["fabric"].value == "cotton", seconds=240)
 
 
 def test_page_pauses_steps_and_restarts(player, page):

@@ -2,33 +2,30 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
-from commands import eslr, refused
+from commands import eslr, refused, simulated, succeeded
+
+from eslr_jax.pose.lbs import skin_garment
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A short run, and its garment as other programs write it."""
     folder = tmp_path_factory.mktemp("score")
-    options = ("--simulator", "physics", "--iterations", 50, "--frames", 8, "--no-pictures")
-    done = eslr("simulate", *options, "--out", folder / "run")
-    assert done.returncode == 0, done.stderr
+    simulated(folder / "run", "--iterations", 50, "--frames", 8)
     return folder
 
 
 @pytest.fixture(scope="module")
 def carried(tshirt, walk):
     """A T-shirt that the joints carry."""
-    rest, weights = (np.asarray(part) for part in (tshirt.rest_positions, tshirt.skin_weights))
-    transforms = np.asarray(walk.joint_transforms)[:, np.asarray(tshirt.skin_indices)]
-    moved = np.einsum("tvkab,vb->tvka", transforms[..., :3], rest) + transforms[..., 3]
-    return np.einsum("vk,tvka->tva", weights, moved).astype(np.float32)
+    return np.asarray(jax.jit(skin_garment)(tshirt, walk.joint_transforms))
 
 
 def scored(*arguments):
-    done = eslr("score", *arguments, "--json", "--every", 2)
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr("score", *arguments, "--json", "--every", 2))
     return json.loads(done.stdout)
 
 
@@ -51,10 +48,8 @@ def test_a_run_its_glb_and_its_npz_score_as_the_run_s_report_says(folder):
 @pytest.mark.slow
 def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
     worn = ("--garment", "pants", "--garment", "tshirt")
-    options = ("--simulator", "physics", "--iterations", 30, "--frames", 4, "--no-pictures", "--settle", 0)
-    done = eslr("simulate", *worn, *options, "--out", tmp_path / "run", "--integrator", "euler")
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    options = ("--iterations", 30, "--frames", 4, "--settle", 0, "--integrator", "euler")
+    report, _ = simulated(tmp_path / "run", *worn, *options)
     glb = tmp_path / "run" / "animation.glb"
     refused(eslr("score", glb), "pants, tshirt", "--garment for every garment")
     score = scored(glb, "--run", tmp_path / "run")
@@ -69,19 +64,23 @@ def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
         ours = sum(row["intersections_cloth"] for row in score["garments"].values())
         assert score["intersections_cloth"] <= ours <= 2 * score["intersections_cloth"]
     assert score["gap_relative_median"] < 0.1
-    named = eslr("score", glb, *worn)
-    assert named.returncode == 0, named.stderr
+    named = succeeded(eslr("score", glb, *worn))
     assert [line.split()[0] for line in named.stdout.splitlines()[-2:]] == ["pants", "tshirt"]
 
 
 @pytest.mark.slow
 def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_table(folder, carried, tshirt):
+    from peers import SCORE, describe_rollout, make_scene
+
     np.savez(folder / "carried.npz", positions=carried, faces=np.asarray(tshirt.faces))
-    done = eslr("score", folder / "carried.npz", "--motion", "cmu_016_32")
-    assert done.returncode == 0, done.stderr
+    done = succeeded(eslr("score", folder / "carried.npz", "--motion", "cmu_016_32"))
     assert "optimality gap" in done.stdout
     assert "the garment stays where it was put on" in done.stdout
-    assert scored(folder / "carried.npz")["gap_relative_median"] > 0.1
+    score = scored(folder / "carried.npz")
+    assert score["gap_relative_median"] > 0.1
+    row = describe_rollout(carried, make_scene("tshirt_1k", 8), every=2)
+    for name, column in SCORE.items():  # as in the table of peers
+        assert score[name] == pytest.approx(row[column], rel=5e-3, abs=1e-6), name
 
 
 @pytest.mark.slow
@@ -96,34 +95,3 @@ def test_what_can_t_be_scored_is_refused_in_one_line(tmp_path, carried, tshirt):
         np.savez(tmp_path / f"{name}.npz", faces=faces % arrays["positions"].shape[1], **arrays)
         refused(eslr("score", tmp_path / f"{name}.npz"), *words)
     assert {path.suffix for path in tmp_path.iterdir()} == {".npz"}
-
-
-def newton_positions(scene):
-    pytest.importorskip("newton")
-    from newton_cloth import Setting, newton_simulator
-
-    return newton_simulator(Setting("style3d", 2, 5)).simulate(scene).positions
-
-
-def blender_positions(scene):
-    from blender_cloth import blender_python, run_blender
-
-    if blender_python() is None:
-        pytest.skip("BLENDER_PYTHON names no Python with bpy")
-    return run_blender(scene, (15, 2)).positions
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("simulate", [newton_positions, blender_positions])
-def test_a_peer_s_trajectory_scores_as_in_the_peers_table(simulate, tmp_path):
-    from peers import SCORE, describe_rollout, make_scene
-
-    scene = make_scene("tshirt_1k", 8)
-    positions = np.asarray(simulate(scene))
-    is_face = np.asarray(scene.garment.rest_areas) > 0
-    np.savez(tmp_path / "peer.npz", positions=positions, faces=np.asarray(scene.garment.faces)[is_face])
-    row = describe_rollout(positions, scene, every=2)
-    score = scored(tmp_path / "peer.npz", "--garment", "tshirt", "--motion", "cmu_016_32")
-    for name, column in SCORE.items():
-        assert score[name] == pytest.approx(row[column], rel=5e-3, abs=1e-6), name
-    assert score["gap_relative_median"] > 0.05

@@ -26,26 +26,13 @@ from eslr_jax import (
 )
 from eslr_jax.networks.registry import MODELS, write_network
 from eslr_jax.pipeline.assets import asset_names, cache, garments, load_garment_file, load_splits
-from eslr_jax.pipeline.assets.cache import (
-    cache_folder,
-    cached,
-    content_key,
-    trim_folder,
-)
-from eslr_jax.pipeline.assets.catalog import is_intact, list_assets
+from eslr_jax.pipeline.assets.cache import cache_folder, cached, content_key, trim_folder
+from eslr_jax.pipeline.assets.catalog import list_assets
 from eslr_jax.pipeline.assets.garments import check_resolution
-from eslr_jax.pipeline.cli.method import is_moving_mesh, load_wearer
+from eslr_jax.pipeline.cli.method import load_wearer
 from eslr_jax.pipeline.dressing.options import FitOptions
-from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.pose.motion import Motion, still_motion
 from eslr_jax.types import Garment
-
-
-def test_every_file_is_intact_and_licensed():
-    for asset in list_assets():
-        assert is_intact(asset), asset.file
-        assert asset.licence
-        assert asset.source
 
 
 def test_the_box_is_small():
@@ -92,8 +79,6 @@ def test_motions_that_cannot_be_played_are_refused(body, tmp_path):
     motion = load_motion()
     with pytest.raises(MotionError, match="another skeleton"):
         pose_body(body, dataclasses.replace(motion, joint_names=("Pelvis", *motion.joint_names[1:])))
-    with pytest.raises(MotionError, match="fewer than"):
-        pose_body(body, motion, num_frames=10_000)
 
 
 def test_broken_motions_are_refused(body):
@@ -149,7 +134,6 @@ def test_a_resolution_is_for_bundled_garments():
 def test_a_moving_mesh_is_a_body_at_rest_and_a_folder_named_like_a_body_is_none(tmp_path, monkeypatch, body):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "anny").mkdir()
-    assert not is_moving_mesh("anny")
     assert load_wearer("anny").joint_names == body.joint_names
     rest = np.asarray(body.rest_positions)
     np.savez("scan.npz", positions=np.stack([rest, rest + 0.1]), faces=np.asarray(body.faces))
@@ -228,18 +212,10 @@ def test_unwritable_cache_costs_only_time(tmp_path, monkeypatch):
 
 
 def test_keys_tell_contents_apart():
-    contents = [
-        (b"ab", b"c"),
-        (b"a", b"bc"),
-        (np.zeros(2),),
-        (np.zeros((1, 2)),),
-        (np.zeros(2, np.float32),),
-        ("a",),
-        (FitOptions(),),
-        (FitOptions(units="cm"),),
-    ]
-    keys = {content_key(*parts) for parts in contents}
-    assert len(keys) == 8
+    arrays = np.zeros(2), np.zeros((1, 2)), np.zeros(2, np.float32)
+    others = "a", FitOptions(), FitOptions(units="cm")
+    contents = [(b"ab", b"c"), (b"a", b"bc"), *((part,) for part in (*arrays, *others))]
+    assert len({content_key(*parts) for parts in contents}) == len(contents)
     assert content_key(np.zeros(2), "a") == content_key(np.zeros(2), "a")
 
 
@@ -256,15 +232,6 @@ def test_two_processes_may_make_the_same_entry(empty_cache):
         _, errors = worker.communicate(timeout=60)
         assert worker.returncode == 0, errors
     assert len(list(empty_cache.iterdir())) == 40
-
-
-def test_fitted_file_is_taken_as_it_is(empty_cache, tmp_path, scan, body):
-    fitted = load_garment_file(scan, body=body)
-    write_garment_npz(tmp_path / "fitted.npz", fitted)
-    again = load_garment_file(tmp_path / "fitted.npz")
-    np.testing.assert_allclose(again.rest_positions, fitted.rest_positions, atol=1e-6)
-    assert again.metadata == fitted.metadata
-    assert not any(path.suffix == ".tmp" for path in empty_cache.iterdir())
 
 
 @pytest.mark.slow
@@ -288,11 +255,11 @@ def test_all_that_computes_an_entry_is_part_of_its_name():
     listed = {file for name in cache._CODE for file in (package / name).glob("*.py")} | {
         package / name for name in cache._CODE if name.endswith(".py")
     }
-    makes_nothing = {package / name for name in ("errors.py", "extras.py")}
+    makes_nothing = {package / name for name in ("errors.py", "pipeline/extras.py")}
     for file in sorted(listed):
         for module in re.findall(r"^from eslr_jax\.(\S+) import", file.read_text(), flags=re.M):
             source = package / (module.replace(".", "/") + ".py")
-            if source.exists() and file.parent.name in ("fit", "geometry"):
+            if source.exists() and file.parent.name in ("mesh", "pose", "dressing"):
                 assert source in listed | makes_nothing, f"{file.name} imports {module}"
 
 

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from garment_files import TO_Z_UP, bundled, dent, scanned_tshirt, source
+from garment_files import TO_Z_UP, bundled, cut_apart, dent, scanned_tshirt, source
 from garment_shapes import rings
 
 from eslr_jax import ConfigError, MeshError, prepare_garment
-from eslr_jax.mesh.topology import boundary_loops, unique_edges, vertex_components, vertex_normals
+from eslr_jax.mesh.topology import boundary_loops
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.postures import arm_postures
@@ -17,6 +17,10 @@ from eslr_jax.pipeline.dressing.report import describe_fit
 from eslr_jax.pipeline.formats.garment import read_garment_source
 
 GIVEN = {"units": "m", "up": "y", "front": "z", "keep_place": True, "arms": "rest"}  # nothing to recognise
+
+
+def count_parts(garment):
+    return trimesh.Trimesh(garment.rest_positions, garment.faces, process=False).body_count
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +126,7 @@ def test_scanned_shirt_is_whole_again(tmp_path, body, shirt):
     assert report["mesh"]["loose_vertices"] == 1
     assert report["placement"]["metres_per_unit"] == 0.01
     assert (report["placement"]["up"], report["placement"]["front"]) == ("z", "-y")
-    assert vertex_components(fitted.faces, len(fitted.rest_positions))[0] == 1
+    assert count_parts(fitted) == 1
     assert fitted.vertex_map[0] == -1
     assert set(fitted.part_names) == {"back", "front", "left_sleeve", "right_sleeve"}
     assert fitted.corner_uvs.shape == (len(fitted.faces), 3, 2)
@@ -141,33 +145,14 @@ def test_inside_out_and_mixed_faces_are_turned_with_their_texture(body, shirt):
     assert fitted.metadata["fit"]["mesh"]["turned_faces"] == len(faces) - 5
 
 
-def two_parts(shirt):
-    """Return the shirt cut along the middle, 6 mm apart, as one mesh of two parts."""
-    right = shirt.rest_positions[shirt.faces].mean(axis=1)[:, 0] > 0
-    shared = np.intersect1d(shirt.faces[right], shirt.faces[~right])
-    copy = np.arange(len(shirt.rest_positions))
-    copy[shared] = len(copy) + np.arange(len(shared))
-    faces = shirt.faces.copy()
-    faces[right] = copy[faces[right]]
-    positions = np.concatenate([shirt.rest_positions, shirt.rest_positions[shared]])
-    positions[np.unique(faces[right])] += [0.006, 0, 0]
-    return positions, faces
-
-
 @pytest.mark.parametrize(("gap", "components", "is_sewn"), [
     (1e-3, "auto", True), (5e-3, "auto", False), (1e-3, "keep", False),
 ])  # fmt: skip
 def test_pieces_whose_seams_were_left_open_are_sewn(body, shirt, gap, components, is_sewn):
     """As programs export a pattern that was not welded: front and back, with a gap between them."""
     is_back = shirt.rest_positions[shirt.faces].mean(axis=1)[:, 2] < 0
-    positions, faces, start = [], [], 0
-    for is_own, shift in ((is_back, -gap), (~is_back, 0.0)):
-        used, local = np.unique(shirt.faces[is_own], return_inverse=True)
-        positions.append(shirt.rest_positions[used] + [0.0, 0.0, shift])
-        faces.append(local.reshape(-1, 3) + start)
-        start += len(used)
-    pieces = source(np.concatenate(positions), np.concatenate(faces))
-    fitted = fit_garment(pieces, body, FitOptions(components=components))
+    pieces = cut_apart(shirt.rest_positions, shirt.faces, is_back, [0.0, 0.0, -gap])
+    fitted = fit_garment(source(*pieces), body, FitOptions(components=components))
     told = " ".join(fitted.metadata["fit"]["warnings"])
     assert ("pieces whose edges lie within 1 cm" in told) == (components == "auto" and not is_sewn)
     if is_sewn:
@@ -187,7 +172,8 @@ def test_a_double_sided_mesh_is_one_layer(body, shirt):
 def test_a_thick_shell_is_doubted(body, shirt):
     """A shirt that was exported with 2 mm of thickness: two layers, sewn along their edges."""
     count = len(shirt.rest_positions)
-    inner = shirt.rest_positions - 0.002 * vertex_normals(shirt.rest_positions, shirt.faces)
+    outer = trimesh.Trimesh(shirt.rest_positions, shirt.faces, process=False)
+    inner = outer.vertices - 0.002 * outer.vertex_normals
     rims = [np.stack([loop, np.roll(loop, -1)], axis=1) for loop in boundary_loops(shirt.faces)]
     start, end = np.concatenate(rims).T
     rim = np.concatenate(
@@ -200,13 +186,14 @@ def test_a_thick_shell_is_doubted(body, shirt):
 
 @pytest.mark.parametrize(("components", "parts"), [("keep", 2), ("join", 1), ("largest", 1)])
 def test_separate_parts(body, shirt, components, parts):
-    positions, faces = two_parts(shirt)
-    fitted = fit_garment(source(positions, faces), body, FitOptions(components=components))
-    assert vertex_components(fitted.faces, len(fitted.rest_positions))[0] == parts
+    is_left = shirt.rest_positions[shirt.faces].mean(axis=1)[:, 0] > 0
+    cut = source(*cut_apart(shirt.rest_positions, shirt.faces, is_left, [0.006, 0, 0]))
+    fitted = fit_garment(cut, body, FitOptions(components=components))
+    assert count_parts(fitted) == parts
     if components == "join":
         assert len(fitted.faces) == len(shirt.faces)
     with pytest.raises(MeshError, match="2 separate components"):
-        fit_garment(source(positions, faces), body, FitOptions(components="refuse"))
+        fit_garment(cut, body, FitOptions(components="refuse"))
 
 
 def test_fitted_garment_has_the_pins_of_file_and_options(body, shirt):
@@ -292,8 +279,7 @@ def test_a_face_and_its_back_are_one(body, shirt):
 def test_remeshing_gives_the_wanted_edges_and_keeps_hems(body, shirt, edge_length):
     pytest.importorskip("pyacvd")
     fitted = fit_garment(source(shirt.rest_positions, shirt.faces), body, FitOptions(edge_length=edge_length))
-    edges = unique_edges(fitted.faces)
-    lengths = np.linalg.norm(np.diff(fitted.sewn_positions[edges], axis=1)[:, 0], axis=1)
+    lengths = trimesh.Trimesh(fitted.sewn_positions, fitted.faces, process=False).edges_unique_length
     assert lengths.mean() == pytest.approx(edge_length, rel=0.12)
     assert lengths.max() < 2.5 * edge_length
     loops, before = boundary_loops(fitted.faces), boundary_loops(shirt.faces)

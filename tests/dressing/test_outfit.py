@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cloth import shaped
 from contact import OUTFITS, dressed, judge, load
-from garment_files import bundled
+from garment_files import bundled, stored
 from garment_shapes import rings
 
 from eslr_jax import AssetError, MeshError, simulate
@@ -22,10 +23,7 @@ from eslr_jax.pipeline.report.crossing import intersecting_pairs
 def tube(radius: float, bottom: float, top: float) -> GarmentFile:
     """Return a tube of cloth around the vertical, its normals outwards."""
     positions, faces = rings([(top, radius, radius, 0.0), (bottom, radius, radius, 0.0)], around=24, rows=7)
-    count = len(positions)
-    return GarmentFile(
-        positions, faces, np.ones((count, 1)), np.zeros((count, 1), int), np.zeros(count, bool)
-    )
+    return stored(positions, faces)
 
 
 def test_a_garment_beneath_another_is_moved_over_it_and_keeps_its_lengths():
@@ -129,7 +127,9 @@ def renamed(body):
 
 
 def test_its_own_body_wears_it(file, tank, body):
-    assert load_garment_file(file, body=body).metadata == tank.metadata
+    worn = load_garment_file(file, body=body)
+    np.testing.assert_allclose(worn.rest_positions, tank.rest_positions, atol=1e-6)
+    assert worn.metadata == tank.metadata
     assert load_garment_file(file, body=larger(body, NUDGE)).metadata == tank.metadata
 
 
@@ -149,9 +149,7 @@ def test_a_body_of_another_shape_does_not(file, body):
 
 
 def test_a_garment_that_is_carried_tells_its_new_body(body):
-    taller = body.replace(
-        rest_positions=1.1 * body.rest_positions, joint_rest_positions=1.1 * body.joint_rest_positions
-    )
+    taller = shaped(body, lambda places: 1.1 * places)
     carried = transfer_garment(bundled("tank_1k"), body, taller)
     joint = carried.metadata["body"]["joint_rest_positions"][3]
     assert joint == pytest.approx(taller.joint_rest_positions[3].tolist(), abs=1e-5)

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cloth import stand_at, turn_about
+import trimesh
+from cloth import shaped, stand_at, turn_about
 from garment_files import TO_Z_UP, bundled, source
-from other_bodies import smpl_female
+from other_bodies import BODIES, measure, smpl_female
 
 from eslr_jax import ConfigError, MeshError
-from eslr_jax.mesh.topology import face_areas, unique_edges
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.dressing.clearance import body_heights
 from eslr_jax.pipeline.dressing.fit import fit_garment
@@ -36,13 +36,11 @@ def woman():
 @pytest.fixture(scope="module")
 def small(body):
     """The bundled body at seven tenths."""
-    fields = ("rest_positions", "joint_rest_positions")
-    return body.replace(**{name: SMALLER * getattr(body, name) for name in fields})
+    return shaped(body, lambda places: SMALLER * places)
 
 
 def lengths(positions, faces):
-    edges = unique_edges(faces)
-    return np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
+    return trimesh.Trimesh(positions, faces, process=False).edges_unique_length
 
 
 def test_the_own_body_changes_nothing(body, shirt):
@@ -94,7 +92,8 @@ def test_another_rig_in_another_pose_wears_it(body, woman, shirt):
     for points, pose in ((carried.sewn_positions, posture), (carried.rest_positions, rest)):
         assert body_heights(points, pose)[0].min() > 0
     after, before = (
-        face_areas(points, shirt.faces) for points in (carried.sewn_positions, shirt.rest_positions)
+        trimesh.triangles.area(points[shirt.faces])
+        for points in (carried.sewn_positions, shirt.rest_positions)
     )
     assert 0.65 < (after / before).min() < (after / before).max() < 1.2, "the cut is even"
     assert carried.skin_indices.max() < len(woman.joint_names)
@@ -124,3 +123,17 @@ def test_what_cannot_be_carried_is_told(body, shirt):
         transfer_garment(shirt, body, nameless)
     with pytest.raises(ConfigError, match="--made-for"):
         transfer_garment(dataclasses.replace(shirt, sewn_positions=shirt.rest_positions), body, body)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "garment"), [("figure", "longsleeve"), ("smpl_female", "pants")])
+def test_a_bundled_garment_sits_and_walks_on_another_body(name, garment):
+    """`experiments/other_bodies.py` measures all nine garments on all five bodies."""
+    ((row, *_),) = measure(make_body(BODIES[name]()), (garment,), frames=60)
+    assert row["inside_at_rest"] == 0
+    assert row["rest_inside_mm"] < 0.1
+    assert row["standing_p99_stretch"] < 1.15
+    assert row["standing_max_stretch"] < 1.2
+    assert row["rest_p99_stretch"] < 1.2  # with the arms up, where the body rests so
+    assert row["walk_finite"]
+    assert row["walk_p99_stretch"] < 1.4

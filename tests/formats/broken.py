@@ -6,6 +6,17 @@ import os
 import pytest
 
 from eslr_jax import EslrError
+from eslr_jax.pipeline.formats.registry import find_reader
+
+
+def read(kind, path, *options):
+    """Read a file of a kind by its suffix."""
+    return find_reader(kind, path)(path, *options)
+
+
+def reader_of(kind):
+    """Return the reader of files of a kind."""
+    return lambda path: read(kind, path)
 
 
 def refuses(read, path, *words):

@@ -8,12 +8,8 @@ import re
 
 import numpy as np
 import pytest
-from broken import pack, refuses, tables_of
+from broken import pack, reader_of, refuses, tables_of
 from whole_files import ACCLAIM, ARRAYS, BYTES, FACES, POSITIONS, character
-
-from eslr_jax.files.npz import write_arrays
-from eslr_jax.pipeline.formats.asf import read_amc
-from eslr_jax.pipeline.formats.gltf_rig import read_gltf_body, read_gltf_motion
 
 NAN, INF = np.nan, np.inf
 # Format, what is replaced in a whole file (a pattern), by what, and a word of the message.
@@ -36,16 +32,14 @@ REPLACED = [
     (".amc", rb"spine 10 20", b"spine nan 1", "finite"),
     (".amc", rb"(?s).*", b"", "no frames"),
     ("garment obj", rb"(?s).*", b"", "empty mesh"),
-    ("garment obj", rb"f 1/1 2/2 3/3", b"f 1/1 2/2", "a face of 2 vertices"),
+    ("garment obj", rb"f 1/1 2/2 3/3", b"f 1/1 2/2", "line 13: a face of 2 vertices"),
     ("garment obj", rb"5/5/5", b"55/5/5", "outside 0..4"),
     ("garment obj", rb"0\.125", b"nan", "not finite"),
     ("garment obj", rb"v 0\.5 0\.0 0\.0", b"v 0.5 0.0", "can't be read"),
     ("garment ply", rb"element vertex 5", b"element vertex 9999999999", "impossible header"),
     ("garment ply", rb"(?s).{40}\Z", b"", "can't be read"),
-    ("garment text.ply", rb"3 3 2 4", b"3 3 2 9", "outside 0..4"),
     ("garment stl", rb"(?s)(?<=\A.{80}).{4}", b"\xff\xff\xff\x7f", "can't be read"),
     ("garment text.stl", rb"vertex 0\.25", b"vertex two", "can't be read"),
-    ("garment glb", rb"glTF", b"GLTF", "can't be read"),
     ("garment glb", rb"(?s).{40}\Z", b"", "truncated"),
     ("garment npz", rb"(?s).{40}\Z", b"", "truncated"),
     ("garment pkl", rb"(?s).{40}\Z", b"", "can't be read as a pickle"),
@@ -76,7 +70,6 @@ CHANGED = [
     ("mesh sequence", {"positions": np.full((3, 12, 3), NAN)}, "frame 0"),
     ("mesh sequence", {"faces": np.full((4, 3), 99)}, "99 of 12 vertices"),
     ("mesh sequence", {"fps": np.array(0.0)}, "frames per second"),
-    ("mesh sequence", {"fps": np.array("fast")}, "one number"),
     ("motion archive", {"joint_names": None}, "no motion"),
     ("motion archive", {"c/fps": None}, "lacks c/fps"),
     ("motion archive", {"c/rotations": np.zeros((4, 5, 3))}, "[frames, 2, 3]"),
@@ -90,7 +83,6 @@ CHANGED = [
     ("body", {"rest_positions": np.linspace(0, 1, 12)[:, None] * [0.5, 0.3, 1.8]}, "turn it so that Y is up"),
     ("garment", {"positions": None}, "it needs faces and"),
     ("garment", {"faces": FACES.astype(float)}, "integer vertex indices"),
-    ("garment", {"faces": FACES + 9}, "outside 0..4"),
     ("garment", {"positions": POSITIONS[:, :2]}, "vertices, 3"),
     ("garment", {"positions": np.array([{}, 1], object)}, "impossible header"),
     ("fitted garment", {"skin_weights": None}, "lacks skin_weights; it has faces"),
@@ -112,18 +104,10 @@ PICKLED = [
     ("hood pkl", {"a": 1}, "body_pose"),
     ("hood pkl", {"pose": np.zeros((2, 72))}, "translation"),
     ("hood pkl", {"pose": np.zeros((2, 72)), "translation": np.zeros((3, 3))}, "translations"),
-    ("hood pkl", {"pose": "walk", "translation": np.zeros((3, 3))}, "rotations"),
     ("hood pkl", {"pose": np.full((2, 72), NAN), "translation": np.zeros((2, 3))}, "finite"),
-    (
-        "hood pkl",
-        {"global_orient": np.zeros((2, 3)), "body_pose": np.zeros((3, 69)), "transl": 0},
-        "file.pkl",
-    ),
     ("garment pkl", [1, 2], "no garments by name"),
     ("garment pkl", {"a": {}, "b": {}}, "name one, as in"),
     ("garment pkl", {"a": {"faces": FACES}}, "no array rest_pos"),
-    ("garment pkl", {"a": {"rest_pos": POSITIONS.astype("U9"), "faces": FACES}}, "no array rest_pos"),
-    ("garment pkl", {"a": {"rest_pos": POSITIONS, "faces": FACES * 7}}, "outside 0..4"),
     (
         "garment pkl",
         {"a": {"rest_pos": POSITIONS, "faces": FACES, "node_type": [0] * 4}},
@@ -138,13 +122,11 @@ TABLES = [
     (lambda t: t["nodes"][2].update(children=[0]), "node"),
     (lambda t: t["nodes"][0].update(rotation=[0, 0, 0, 0]), "rotation"),
     (lambda t: t["accessors"][1].update(count=10**9), "1000000000 values in a view"),
-    (lambda t: t["bufferViews"][0].update(byteOffset=10**9), "values in a view"),
     (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "draco"),
     (lambda t: t["meshes"][0]["primitives"][0].update(mode=5), "strips"),
     (lambda t: t["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "accessors None"),
     (lambda t: t.pop("meshes"), "meshes 0, which it doesn't have"),
     (lambda t: t["buffers"][0].update(uri="../../secret.bin"), "not beside it"),
-    (lambda t: t["buffers"][0].update(uri="http://example.org/x"), "not beside it"),
     (lambda t: t["buffers"][0].update(uri="other.bin"), "not there"),
 ]
 
@@ -152,7 +134,7 @@ TABLES = [
 @pytest.mark.parametrize(("kind", "old", "new", "word"), REPLACED)
 def test_replaced_bytes_are_named(tmp_path, kind, old, new, word):
     if kind in ACCLAIM:
-        suffix, read = kind, lambda _: read_amc(tmp_path / "file.amc")
+        suffix, read = kind, lambda _: reader_of("motion")(tmp_path / "file.amc")
         for beside, good in ACCLAIM.items():
             (tmp_path / f"file{beside}").write_bytes(good)
     else:
@@ -169,7 +151,7 @@ def test_replaced_bytes_are_named(tmp_path, kind, old, new, word):
 def test_changed_arrays_are_named(tmp_path, kind, changes, word):
     make, read = ARRAYS[kind]
     values = make() | changes
-    write_arrays(tmp_path / "file.npz", {key: value for key, value in values.items() if value is not None})
+    np.savez(tmp_path / "file.npz", **{key: value for key, value in values.items() if value is not None})
     refuses(read, tmp_path / "file.npz", word)
 
 
@@ -184,14 +166,14 @@ def test_changed_tables_of_gltf_are_named(tmp_path, change, word):
     tables, blob = tables_of(character())
     change(tables)
     (tmp_path / "file.glb").write_bytes(pack(tables, blob))
-    refuses(read_gltf_body, tmp_path / "file.glb", word)
+    refuses(reader_of("body"), tmp_path / "file.glb", word)
 
 
-@pytest.mark.parametrize("read", [read_gltf_body, read_gltf_motion])
+@pytest.mark.parametrize("kind", ["body", "motion"])
 @pytest.mark.parametrize("content", [b"", b"glTF", b"{}", b"[1, 2]", b"{" * 5000])
-def test_what_is_no_gltf_is_refused(tmp_path, content, read):
+def test_what_is_no_gltf_is_refused(tmp_path, content, kind):
     (tmp_path / "file.glb").write_bytes(content)
-    refuses(read, tmp_path / "file.glb")
+    refuses(reader_of(kind), tmp_path / "file.glb")
 
 
 @pytest.mark.parametrize("kind", BYTES)

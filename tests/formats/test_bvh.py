@@ -2,12 +2,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_files import write_bvh
+from broken import read
+from foreign_files import animate, write_bvh
 from scipy.spatial.transform import Rotation
-
-from eslr_jax.pipeline.formats.bvh import read_bvh
-from eslr_jax.pose.retarget import count_resampled
-from eslr_jax.pose.skeleton import Skeleton, SkeletonMotion, chain_positions
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 SMALL = """HIERARCHY
@@ -36,7 +33,7 @@ Frame Time: 0.04
 def test_a_small_file_by_hand(tmp_path):
     path = tmp_path / "small.bvh"
     path.write_text(SMALL)
-    motion = read_bvh(path)
+    motion = read("motion", path)
     assert motion.skeleton.joint_names == ("Hips", "Spine")
     assert motion.skeleton.parents == (-1, 0)
     assert motion.fps == pytest.approx(25.0)
@@ -49,7 +46,7 @@ def test_a_small_file_by_hand(tmp_path):
 
 def test_the_mark_that_windows_puts_first_is_no_word(tmp_path):
     (tmp_path / "marked.bvh").write_text(SMALL, encoding="utf-8-sig")
-    assert read_bvh(tmp_path / "marked.bvh").skeleton.joint_names == ("Hips", "Spine")
+    assert read("motion", tmp_path / "marked.bvh").skeleton.joint_names == ("Hips", "Spine")
 
 
 @pytest.mark.parametrize(("time", "fps"), [("0.0333333", 30), ("0.008333", 120), ("0.033367", 1 / 0.033367)])
@@ -57,13 +54,13 @@ def test_a_rounded_frame_time_loses_no_frame(tmp_path, time, fps):
     head, _ = SMALL.split("MOTION")
     rows = "0 0 0 0 0 0 0 0 0\n" * 300
     (tmp_path / "long.bvh").write_text(f"{head}MOTION\nFrames: 300\nFrame Time: {time}\n{rows}")
-    motion = read_bvh(tmp_path / "long.bvh")
+    motion = read("motion", tmp_path / "long.bvh")
     assert motion.fps == fps  # 29.97 is a rate of its own
-    assert count_resampled(300, motion.fps, round(fps)) == 300
+    assert len(motion.positions) == 300
 
 
 def test_cmu_clip_has_rigid_bones_and_a_person_of_plausible_size():
-    motion = read_bvh(FIXTURES / "cmu_01_01.bvh")
+    motion = read("motion", FIXTURES / "cmu_01_01.bvh")
     assert motion.rotations.shape == (120, 31, 3, 3)
     bones = [j for j, parent in enumerate(motion.skeleton.parents) if parent >= 0]
     above = [motion.skeleton.parents[j] for j in bones]
@@ -77,14 +74,13 @@ def test_cmu_clip_has_rigid_bones_and_a_person_of_plausible_size():
 @pytest.mark.parametrize("order", ["ZXY", "XYZ", "ZYX"])
 def test_round_trip_is_exact(tmp_path, order):
     rng = np.random.default_rng(0)
-    skeleton = Skeleton(("a", "b c", "d", "e"), (-1, 0, 1, 0), rng.normal(size=(4, 3)))
-    turned = Rotation.random(20, rng=rng).as_matrix().reshape(5, 4, 3, 3)
-    positions = chain_positions(turned, rng.normal(size=(5, 3)), skeleton)
-    write_bvh(tmp_path / "a.bvh", SkeletonMotion("a", skeleton, turned, positions, 60.0), order=order)
-    back = read_bvh(tmp_path / "a.bvh")
-    order_of = [back.skeleton.joint_names.index(name) for name in skeleton.joint_names]
+    rest, turned = rng.normal(size=(4, 3)), Rotation.random(20, rng=rng).as_matrix().reshape(5, 4, 3, 3)
+    motion = animate(("a", "b c", "d", "e"), (-1, 0, 1, 0), rest, turned, rng.normal(size=(5, 3)), 60.0)
+    write_bvh(tmp_path / "a.bvh", motion, order=order)
+    back = read("motion", tmp_path / "a.bvh")
+    order_of = [back.skeleton.joint_names.index(name) for name in motion.skeleton.joint_names]
     np.testing.assert_allclose(back.rotations[:, order_of], turned, atol=1e-6)
-    np.testing.assert_allclose(back.positions[:, order_of], positions, atol=1e-6)
+    np.testing.assert_allclose(back.positions[:, order_of], motion.positions, atol=1e-6)
     assert back.fps == pytest.approx(60.0, rel=1e-6)
 
 
@@ -93,5 +89,5 @@ def test_a_frame_count_that_is_off_by_one_is_a_warning(tmp_path, claimed):
     path = tmp_path / "clip.bvh"
     path.write_text(SMALL.replace("Frames: 2", f"Frames: {claimed}"))
     with pytest.warns(UserWarning, match=rf"clip.bvh says {claimed} frames and has 2"):
-        motion = read_bvh(path)
+        motion = read("motion", path)
     assert len(motion.positions) == 2

@@ -9,12 +9,14 @@ import numpy as np
 import pygltflib as gltf
 import pytest
 import trimesh
-from commands import eslr
+from commands import eslr, succeeded
+from garment_files import stored
+from test_gltf import Player, make_body
 
-from eslr_jax import AssetError, load_motion, pose_body
-from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
+from eslr_jax import AssetError
+from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.export import export_trajectory
-from eslr_jax.pipeline.formats.garment import GarmentFile, in_vertex_order
+from eslr_jax.pipeline.formats.garment import in_vertex_order
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence
 from eslr_jax.pipeline.formats.palette import SKIN_COLOR
 from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, write_trajectory
@@ -52,15 +54,7 @@ def garment():
     faces = np.asarray(SPHERE.faces)
     uvs = rng.random((VERTICES, 2))[faces].round(3)
     uvs[:20] += 0.5  # the other side of a seam
-    return GarmentFile(
-        np.asarray(SPHERE.vertices),
-        faces,
-        np.ones((VERTICES, 1)),
-        np.zeros((VERTICES, 1), int),
-        np.zeros(VERTICES, bool),
-        corner_uvs=uvs,
-        vertex_map=places,
-    )
+    return stored(np.asarray(SPHERE.vertices), faces, corner_uvs=uvs, vertex_map=places)
 
 
 def corner_points(positions, faces):
@@ -103,28 +97,17 @@ def test_usd_holds_every_frame(tmp_path, run, garment, suffix):
 
 
 def test_glb_holds_every_frame(tmp_path, run, garment):
-    path = export_trajectory(run, tmp_path / "run.glb", garment=garment)
-    document = gltf.GLTF2().load(str(path))
-    blob = document.binary_blob()
-
-    def read(index, width, dtype=np.float32):
-        accessor = document.accessors[index]
-        offset = document.bufferViews[accessor.bufferView].byteOffset
-        return np.frombuffer(blob, dtype, accessor.count * width, offset).reshape(-1, width)
-
-    assert [mesh.name for mesh in document.meshes] == ["My shirt", "body"]
-    primitive = document.meshes[0].primitives[0]
-    base = read(primitive.attributes.POSITION, 3)
-    faces = read(primitive.indices, 1, np.uint16).reshape(-1, 3)
-    shapes = np.stack([read(target["POSITION"], 3) for target in primitive.targets])
-    weights = read(document.animations[0].samplers[0].output, len(shapes))
+    player = Player(export_trajectory(run, tmp_path / "run.glb", garment=garment))
+    assert [mesh.name for mesh in player.document.meshes] == ["My shirt", "body"]
+    primitive = player.document.meshes[0].primitives[0]
+    faces = player.read(primitive.indices).reshape(-1, 3)
     for frame in range(FRAMES):
-        points = base + np.einsum("s,sva->va", weights[frame], shapes)
+        points = player.positions("My shirt", frame * STEP)
         count = len(garment.vertex_map)
         np.testing.assert_allclose(points[:count], run.positions[frame][garment.vertex_map], atol=1e-6)
         expected = corner_points(run.positions[frame], run.faces)
         np.testing.assert_allclose(corner_points(points, faces), expected, atol=1e-6)
-    uvs = read(primitive.attributes.TEXCOORD_0, 2)
+    uvs = player.read(primitive.attributes.TEXCOORD_0)
     np.testing.assert_allclose(corner_points(uvs, faces) * [1, -1] + [0, 1], garment.corner_uvs, atol=1e-6)
 
 
@@ -215,22 +198,6 @@ def shown_in_blender(path, frames, vertices=0):
 
 @needs_blender
 @pytest.mark.slow
-@pytest.mark.parametrize(("suffix", "name"), [("usdc", "My_shirt"), ("glb", "My shirt"), ("abc", "My_shirt")])
-def test_blender_shows_every_frame(tmp_path, run, garment, suffix, name):
-    path = export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment)
-    seen = shown_in_blender(path, FRAMES)
-    for mesh, positions, faces in (
-        (name, run.positions, run.faces),
-        ("body", run.body.positions, run.body.faces),
-    ):
-        points, corners = seen[f"{mesh}/positions"], seen[f"{mesh}/faces"]
-        for frame in range(FRAMES):
-            expected = corner_points(positions[frame], faces) @ Z_UP
-            np.testing.assert_allclose(corner_points(points[frame], corners), expected, atol=1e-5)
-
-
-@needs_blender
-@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["pc2", "mdd"])
 def test_blender_lays_point_caches_on_the_mesh(tmp_path, run, garment, suffix):
     path = export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment)
@@ -239,33 +206,23 @@ def test_blender_lays_point_caches_on_the_mesh(tmp_path, run, garment, suffix):
 
 
 @pytest.fixture(scope="module")
-def skinned(run, body):
-    """A run on the bundled body, which joints move."""
-    poses = pose_body(body, load_motion("jump"), num_frames=FRAMES)
-    track = AnimatedMesh(
-        name="body",
-        color=SKIN_COLOR,
-        positions=np.asarray(poses.positions),
-        faces=np.asarray(poses.faces),
-        rest_positions=np.asarray(poses.rest_positions),
-        skin=Skin(
-            np.asarray(body.skin_weights), np.asarray(body.skin_indices), np.asarray(poses.joint_transforms),
-            np.asarray(body.joint_rest_positions), body.parents, body.joint_names,
-        ),
-    )  # fmt: skip
-    return replace(run, body=track)
+def skinned(run):
+    """A run on a body that joints move."""
+    return replace(run, body=make_body(FRAMES))
 
 
 @needs_blender
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", ["glb", "usdc"])
-def test_blender_bends_the_skinned_body(tmp_path, skinned, suffix):
-    path = export_trajectory(skinned, tmp_path / f"run.{suffix}")
-    seen = shown_in_blender(path, FRAMES)
-    points, corners = seen["body/positions"], seen["body/faces"]
-    for frame in range(FRAMES):
-        expected = corner_points(skinned.body.positions[frame], skinned.body.faces) @ Z_UP
-        np.testing.assert_allclose(corner_points(points[frame], corners), expected, atol=1e-4)
+@pytest.mark.parametrize("bends", [False, True])
+@pytest.mark.parametrize(("suffix", "name"), [("usdc", "My_shirt"), ("glb", "My shirt"), ("abc", "My_shirt")])
+def test_blender_shows_every_frame(tmp_path, run, skinned, garment, suffix, name, bends):
+    run = skinned if bends else run
+    seen = shown_in_blender(export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment), FRAMES)
+    for mesh, track, most in ((name, run, 1e-5), ("body", run.body, 1e-4 if bends else 1e-5)):
+        points, corners = seen[f"{mesh}/positions"], seen[f"{mesh}/faces"]
+        for frame in range(FRAMES):
+            expected = corner_points(track.positions[frame], track.faces) @ Z_UP
+            np.testing.assert_allclose(corner_points(points[frame], corners), expected, atol=most)
 
 
 def test_glb_of_a_run_moves_the_body_by_its_joints(tmp_path, skinned):
@@ -324,42 +281,37 @@ def test_garments_of_an_outfit_are_meshes_of_their_own_colours(tmp_path, run):
     both = np.concatenate([run.positions, run.positions + np.float32(1)], axis=1)
     faces = np.concatenate([run.faces, run.faces + VERTICES])
     worn = replace(run, positions=both, velocities=np.zeros_like(both), faces=faces, body=None)
-    stored = GarmentFile(
-        both[0],
-        faces,
-        np.ones((2 * VERTICES, 1)),
-        np.zeros((2 * VERTICES, 1), int),
-        np.zeros(2 * VERTICES, bool),
-        metadata={"outfit": {"pants": VERTICES, "tshirt": VERTICES}},
-    )
-    document = gltf.GLTF2().load(str(export_trajectory(worn, tmp_path / "a.glb", garment=stored)))
+    outfit = stored(both[0], faces, metadata={"outfit": {"pants": VERTICES, "tshirt": VERTICES}})
+    document = gltf.GLTF2().load(str(export_trajectory(worn, tmp_path / "a.glb", garment=outfit)))
     assert [node.mesh for node in document.nodes if node.name in ("pants", "tshirt")] == [0, 1]
     colors = [material.pbrMetallicRoughness.baseColorFactor for material in document.materials]
     assert colors[0] != colors[1]
-    stage = usd.Stage.Open(str(export_trajectory(worn, tmp_path / "a.usda", garment=stored)))
+    stage = usd.Stage.Open(str(export_trajectory(worn, tmp_path / "a.usda", garment=outfit)))
     for name, moved in (("pants", 0), ("tshirt", 1)):
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}"))
         np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get(2)), run.positions[2] + moved, atol=1e-6)
-    assert len(read_points(export_trajectory(worn, tmp_path / "a.npz", garment=stored))) == FRAMES
+    with np.load(export_trajectory(worn, tmp_path / "a.npz", garment=outfit)) as arrays:
+        assert len(arrays["positions"]) == FRAMES
     with pytest.warns(UserWarning, match="holds pants, tshirt one after another"):
-        export_trajectory(worn, tmp_path / "a.pc2", garment=stored)
+        export_trajectory(worn, tmp_path / "a.pc2", garment=outfit)
     uvs = np.zeros((len(faces), 3, 2))
     uvs[len(run.faces) :] = 0.5  # of the shirt alone
-    textured = replace(stored, corner_uvs=uvs)
+    textured = replace(outfit, corner_uvs=uvs)
     document = gltf.GLTF2().load(str(export_trajectory(worn, tmp_path / "b.glb", garment=textured)))
     parts = [mesh.primitives[0].attributes.TEXCOORD_0 is not None for mesh in document.meshes]
     assert parts == [False, True]
 
 
-def read_points(path):
-    return np.load(path)["positions"]
-
-
-def test_formats_that_are_unknown_or_don_t_fit_are_refused(tmp_path, run):
+def test_formats_that_are_unknown_and_garments_that_don_t_fit_are_refused(tmp_path, run, garment):
     for path, options, word in (
         (tmp_path / "run.fbx", {}, "--format"),
         (tmp_path / "run.pc2", {"content": "both"}, "one mesh"),
         (tmp_path / "nowhere" / "run.glb", {}, "folder"),
+        (
+            tmp_path / "a.glb",
+            {"garment": replace(garment, faces=garment.faces[::-1])},
+            "not the one of this run",
+        ),
     ):
         with pytest.raises(AssetError, match=word):
             export_trajectory(run, path, **options)
@@ -370,15 +322,9 @@ def test_formats_that_are_unknown_or_don_t_fit_are_refused(tmp_path, run):
     assert sorted(os.listdir(tmp_path)) == ["full"]
 
 
-def test_another_garment_is_refused(tmp_path, run, garment):
-    with pytest.raises(AssetError, match="not the one of this run"):
-        export_trajectory(run, tmp_path / "a.glb", garment=replace(garment, faces=garment.faces[::-1]))
-
-
 @pytest.mark.slow
 def test_the_command_exports_a_run(tmp_path, run):
     write_trajectory(tmp_path / "trajectory.npz", run)
-    result = eslr("export", tmp_path, "--out", tmp_path / "a.mdd")
-    assert result.returncode == 0, result.stderr
+    result = succeeded(eslr("export", tmp_path, "--out", tmp_path / "a.mdd"))
     assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
     assert (tmp_path / "a.mdd").stat().st_size == 8 + 4 * FRAMES + run.positions.nbytes

@@ -15,16 +15,13 @@ import time
 import jax
 import numpy as np
 import pytest
-from broken import pack, tables_of
+from broken import pack, reader_of, tables_of
 from foreign_files import write_bvh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from whole_files import ACCLAIM, ARRAYS, BYTES, character, small_motion
 
-from eslr_jax import EslrError
-from eslr_jax.pipeline.formats.asf import read_amc
-from eslr_jax.pipeline.formats.bvh import read_bvh
-from eslr_jax.pipeline.rigs.rig import make_motion
+from eslr_jax import EslrError, load_motion
 
 MAX_SECONDS = 10.0
 MAX_MEMORY = 1 << 30  # [bytes] that the process may grow by
@@ -195,12 +192,8 @@ def case(kind):
         good = make()
         return ARRAY_EDITS, lambda edits: archive(damage_arrays(good, edits)), ".npz", read
     if kind in ACCLAIM:
-        return (
-            EDITS,
-            lambda edits: damage(ACCLAIM[kind], edits),
-            kind,
-            lambda path: read_amc(path.with_suffix(".amc")),
-        )
+        read = lambda path: reader_of("motion")(path.with_suffix(".amc"))  # noqa: E731
+        return EDITS, lambda edits: damage(ACCLAIM[kind], edits), kind, read
     make, suffix, read = BYTES[kind]
     good = make()
     return EDITS, lambda edits: damage(good, edits), suffix, read
@@ -246,10 +239,9 @@ def test_thousands_of_damaged_files(tmp_path, kind):
 
 
 def test_a_damaged_motion_moves_the_body_or_is_refused(tmp_path, body):
-    good = small_motion()
     path = tmp_path / "file.bvh"
-    write_bvh(path, good)
+    write_bvh(path, small_motion())
     text = path.read_bytes()
     for at in range(0, len(text), 97):
         path.write_bytes(damage(text, [("set", at / len(text), b"9")]))
-        check(lambda file: make_motion(read_bvh(file), body, up="auto"), path)
+        check(lambda file: load_motion(file, body=body), path)

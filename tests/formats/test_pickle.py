@@ -4,12 +4,11 @@ import collections
 import os
 import pickle
 import struct
-import sys
-import types
+from functools import partial
 
 import numpy as np
 import pytest
-import scipy.sparse
+from broken import refuses
 
 from eslr_jax import AssetError
 from eslr_jax.pipeline.formats.pickle import read_pickle
@@ -43,27 +42,6 @@ def test_arrays_and_containers_come_back(tmp_path, protocol):
     np.testing.assert_array_equal(loaded["nested"][0]["center"], [1, 2])
     assert loaded["nested"][1] == value["nested"][1]
     assert loaded["again"] is loaded["same"]
-
-
-@pytest.mark.parametrize("protocol", [0, 1, 2])
-def test_body_model_layout_of_python_2(tmp_path, protocol, monkeypatch):
-    chumpy = types.ModuleType("chumpy.ch")
-
-    class Ch:
-        pass
-
-    Ch.__module__, Ch.__qualname__ = "chumpy.ch", "Ch"
-    chumpy.Ch = Ch
-    monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
-    monkeypatch.setitem(sys.modules, "chumpy.ch", chumpy)
-    shapes = Ch()
-    shapes.__dict__.update(x=np.arange(30.0).reshape(5, 3, 2), _cache=object)
-    regressor = scipy.sparse.csc_matrix(np.eye(2, 5))
-    path = dump(tmp_path, {"shapedirs": shapes, "J_regressor": regressor}, protocol)
-    monkeypatch.undo()
-    loaded = read_pickle(path, content="body")
-    np.testing.assert_array_equal(loaded["shapedirs"], np.arange(30.0).reshape(5, 3, 2))
-    np.testing.assert_array_equal(loaded["J_regressor"].toarray(), np.eye(2, 5))
 
 
 class Hostile:
@@ -113,15 +91,12 @@ def broken():
     ("name", "content"), list(broken()), ids=lambda value: value if isinstance(value, str) else ""
 )
 def test_broken_pickles_are_named_in_one_line(tmp_path, name, content):
-    with pytest.raises(AssetError, match=r"test file .*content\.pkl can't be read as a pickle") as caught:
-        read_pickle(dump(tmp_path, content), content="test")
-    assert "\n" not in str(caught.value)
+    path = dump(tmp_path, content)
+    refuses(partial(read_pickle, content="test"), path, "test file ", "content.pkl can't be read as a pickle")
 
 
 def test_missing_folder_and_large_files_are_named(tmp_path):
-    with pytest.raises(AssetError, match="doesn't exist"):
-        read_pickle(tmp_path / "none.pkl", content="test")
-    with pytest.raises(AssetError, match="is a folder"):
-        read_pickle(tmp_path, content="test")
-    with pytest.raises(AssetError, match="larger than 3 bytes"):
-        read_pickle(dump(tmp_path, [1, 2]), content="test", max_bytes=3)
+    read = partial(read_pickle, content="test", max_bytes=3)
+    refuses(read, tmp_path / "none.pkl", "doesn't exist")
+    refuses(read, tmp_path, "is a folder")
+    refuses(read, dump(tmp_path, [1, 2]), "larger than 3 bytes")

@@ -8,13 +8,15 @@ import pickle
 import sys
 import types
 import zipfile
+from functools import partial
 
 import numpy as np
 import pytest
+from broken import refuses
 
-from eslr_jax import AssetError
 from eslr_jax.pipeline.formats.torch_archive import read_torch
 
+read = partial(read_torch, content="checkpoint")
 STORAGES = {"f4": "FloatStorage", "f8": "DoubleStorage", "i8": "LongStorage", "b1": "BoolStorage"}
 
 
@@ -103,16 +105,16 @@ def test_tensors_and_containers_come_back(tmp_path, order):
         "flags": Tensor(np.array([True, False])),
         "config": {"lr": 5e-5, "steps": [1, None, "x"]},
     }
-    read = read_torch(write_archive(tmp_path / "a.pth", content, order=order), content="checkpoint")
-    np.testing.assert_array_equal(read["weights"]["a"], values.reshape(3, 4))
-    assert read["weights"]["b"].dtype == np.float64
-    assert read["weights"]["b"] == 1.5
-    np.testing.assert_array_equal(read["turned"], values.reshape(3, 4).T)
-    np.testing.assert_array_equal(read["piece"], [1, 6])
-    assert read["empty"].shape == (0, 3)
-    assert read["scalar"] == 7
-    np.testing.assert_array_equal(read["flags"], [True, False])
-    assert read["config"] == content["config"]
+    found = read(write_archive(tmp_path / "a.pth", content, order=order))
+    np.testing.assert_array_equal(found["weights"]["a"], values.reshape(3, 4))
+    assert found["weights"]["b"].dtype == np.float64
+    assert found["weights"]["b"] == 1.5
+    np.testing.assert_array_equal(found["turned"], values.reshape(3, 4).T)
+    np.testing.assert_array_equal(found["piece"], [1, 6])
+    assert found["empty"].shape == (0, 3)
+    assert found["scalar"] == 7
+    np.testing.assert_array_equal(found["flags"], [True, False])
+    assert found["config"] == content["config"]
 
 
 def bad_archives():
@@ -129,21 +131,14 @@ def bad_archives():
 @pytest.mark.parametrize(("content", "damage"), [case[1:] for case in bad_archives()], ids=range(7))
 def test_broken_archives_are_named_in_one_line(tmp_path, content, damage):
     path = write_archive(tmp_path / "a.pth", {"x": content}, damage=damage)
-    with pytest.raises(
-        AssetError, match=r"checkpoint file .*a\.pth can't be read as a PyTorch archive"
-    ) as caught:
-        read_torch(path, content="checkpoint")
-    assert "\n" not in str(caught.value)
+    refuses(read, path, "checkpoint file ", "a.pth can't be read as a PyTorch archive")
 
 
 def test_files_that_are_no_archive_are_named(tmp_path):
     (tmp_path / "old.pth").write_bytes(pickle.dumps([1]))
-    with pytest.raises(AssetError, match=r"no archive of PyTorch 1\.6"):
-        read_torch(tmp_path / "old.pth", content="checkpoint")
+    refuses(read, tmp_path / "old.pth", "no archive of PyTorch 1.6")
     with zipfile.ZipFile(tmp_path / "other.pth", "w") as archive:
         archive.writestr("a.txt", "x")
-    with pytest.raises(AssetError, match=r"no data\.pkl"):
-        read_torch(tmp_path / "other.pth", content="checkpoint")
+    refuses(read, tmp_path / "other.pth", "no data.pkl")
     path = write_archive(tmp_path / "a.pth", {"x": Tensor(np.zeros(100, np.float32))})
-    with pytest.raises(AssetError, match="larger than 100 bytes"):
-        read_torch(path, content="checkpoint", max_bytes=100)
+    refuses(partial(read, max_bytes=100), path, "larger than 100 bytes")

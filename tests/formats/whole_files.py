@@ -5,30 +5,35 @@ from __future__ import annotations
 import io
 import pickle
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from foreign_files import SMPL_PARENTS, write_amass, write_bvh, write_character, write_hood, write_vto
+from broken import read, reader_of
+from foreign_files import (
+    SMPL_PARENTS,
+    animate,
+    write_amass,
+    write_bvh,
+    write_character,
+    write_hood,
+    write_vto,
+)
 
-from eslr_jax.files.npz import write_arrays
+from eslr_jax import load_body
 from eslr_jax.pipeline.assets.motions import read_joint_map
 from eslr_jax.pipeline.formats.animated import AnimatedMesh
-from eslr_jax.pipeline.formats.bundled import read_body, read_motion_archive
-from eslr_jax.pipeline.formats.bvh import read_bvh
+from eslr_jax.pipeline.formats.bundled import read_motion_archive
 from eslr_jax.pipeline.formats.garment import (
     GarmentFile,
     read_garment_npz,
     read_garment_source,
     write_garment_npz,
 )
-from eslr_jax.pipeline.formats.gltf_rig import read_gltf_body, read_gltf_motion
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence
-from eslr_jax.pipeline.formats.smpl import read_amass, read_smpl_body, read_smpl_pickle
 from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, read_trajectory, write_trajectory
-from eslr_jax.pipeline.rigs.rig import make_body
 from eslr_jax.pipeline.rigs.sequence import pose_sequence
-from eslr_jax.pose.skeleton import Skeleton, SkeletonMotion, chain_positions
 
 POSITIONS = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0.25], [0, 0.5, 0.125], [0.25, 0.75, 0]])
 FACES = np.array([[0, 1, 2], [2, 3, 0], [3, 2, 4]])
@@ -58,7 +63,8 @@ def whole_garment(kind: str, path: Path) -> None:
     elif kind in ("ply", "stl", "glb"):
         path.write_bytes(mesh.export(file_type=kind))
     elif kind == "npz":
-        write_arrays(path, {"positions": POSITIONS, "faces": FACES})
+        with path.open("wb") as stream:  # whatever its suffix
+            np.savez(stream, positions=POSITIONS, faces=FACES)
     elif kind == "pkl":
         entry = {"rest_pos": POSITIONS, "faces": FACES, "node_type": np.array([[0], [0], [3], [0], [0]])}
         path.write_bytes(pickle.dumps({"scarf": entry}))
@@ -92,9 +98,8 @@ GARMENTS = {
 def small_motion():
     rng = np.random.default_rng(0)
     names = ("Hips", "Spine", "Head", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "LeftArm", "RightArm")
-    skeleton = Skeleton(names, (-1, 0, 1, 0, 3, 4, 0, 1, 1), rng.normal(size=(9, 3)))
     turned = np.tile(np.eye(3), (3, 9, 1, 1))
-    return SkeletonMotion("a", skeleton, turned, chain_positions(turned, np.zeros((3, 3)), skeleton), 30.0)
+    return animate(names, (-1, 0, 1, 0, 3, 4, 0, 1, 1), rng.normal(size=(9, 3)), turned, np.zeros((3, 3)))
 
 
 def small_model():
@@ -136,20 +141,17 @@ def character():
 
 POSES = np.random.default_rng(1).normal(0.0, 0.3, (3, 24, 3))
 PELVIS = np.zeros((3, 3))
+amass = partial(content, write_amass, POSES, PELVIS, 30.0, suffix=".npz")
 GRID = np.random.default_rng(2).uniform(0, 1, (3, 12, 3))
 GRID_FACES = np.arange(12).reshape(4, 3)
 BYTES = {
-    "bvh": (lambda: content(write_bvh, small_motion()), ".bvh", read_bvh),
-    "smpl pkl": (
-        lambda: pickle.dumps(small_model(), protocol=2),
-        ".pkl",
-        lambda p: make_body(read_smpl_body(p)),
-    ),
-    "hood pkl": (lambda: content(write_hood, POSES, PELVIS), ".pkl", read_smpl_pickle),
-    "vto pkl": (lambda: content(write_vto, POSES, PELVIS), ".pkl", read_smpl_pickle),
-    "glb": (character, ".glb", lambda p: (make_body(read_gltf_body(p)), read_gltf_motion(p))),
+    "bvh": (lambda: content(write_bvh, small_motion()), ".bvh", reader_of("motion")),
+    "smpl pkl": (lambda: pickle.dumps(small_model(), protocol=2), ".pkl", load_body),
+    "hood pkl": (lambda: content(write_hood, POSES, PELVIS), ".pkl", reader_of("motion")),
+    "vto pkl": (lambda: content(write_vto, POSES, PELVIS), ".pkl", reader_of("motion")),
+    "glb": (character, ".glb", lambda p: (load_body(p), read("motion", p))),
     "joint map": (lambda: b'{"LeftArm": "left_shoulder", "Head": ""}', ".json", read_joint_map),
-    "amass bytes": (lambda: content(write_amass, POSES, PELVIS, 30.0, suffix=".npz"), ".npz", read_amass),
+    "amass bytes": (amass, ".npz", reader_of("motion")),
 }
 for _kind, _read in GARMENTS.items():
     BYTES[f"garment {_kind}"] = (
@@ -162,8 +164,8 @@ ACCLAIM = {
     ".amc": b":DEGREES\n1\nroot 0 1 0 0 20 0\nspine 10 20\n2\nroot 0 1 0 0 30 0\nspine 20 -20\n",
 }
 ARRAYS = {
-    "smpl npz": (small_model, lambda p: make_body(read_smpl_body(p))),
-    "amass": (lambda: arrays_of(content(write_amass, POSES, PELVIS, 30.0, suffix=".npz")), read_amass),
+    "smpl npz": (small_model, load_body),
+    "amass": (lambda: arrays_of(amass()), reader_of("motion")),
     "mesh sequence": (
         lambda: {"positions": GRID, "faces": GRID_FACES, "fps": np.array(30.0)},
         lambda p: pose_sequence(read_mesh_sequence(p)),
@@ -181,7 +183,7 @@ ARRAYS = {
             "joint_names": np.array(["a", "b"]), "skin_weights": np.full((12, 2), 0.5),
             "skin_indices": np.tile([0, 1], (12, 1)), "faces": GRID_FACES, "obstacle_faces": np.ones(4, bool),
         },
-        read_body,
+        reader_of("body"),
     ),
     "garment": (lambda: {"positions": POSITIONS, "faces": FACES}, read_as_garment),
     "fitted garment": (

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from foreign_files import smpl_parameters, write_amass, write_hood
+from commands import eslr, slip, succeeded, worn
+from foreign_files import moving, smpl_parameters, write_amass, write_hood
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress, write_obj
 from PIL import Image
 
-from eslr_jax import load_motion
 from eslr_jax.pipeline.report.fields import run_field
 from eslr_jax.pipeline.report.run import read_run
-from eslr_jax.pipeline.rigs.rig import skeleton_motion
 
+pytestmark = pytest.mark.slow
+TWO_SECONDS = ("--iterations", 20, "--frames", 61, "--settle", 0)
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 
@@ -25,7 +25,7 @@ def motions(tmp_path_factory, body):
     folder = tmp_path_factory.mktemp("motions")
     for name in ("cmu_01_01.bvh", "makehuman_walk1.bvh"):
         shutil.copy(FIXTURES / name, folder / name)
-    rotations, pelvis = smpl_parameters(skeleton_motion(load_motion("cmu_047_01"), body))
+    rotations, pelvis = smpl_parameters(moving(body, "cmu_047_01"))
     write_amass(folder / "amass.npz", rotations, pelvis, 30.0)
     write_hood(folder / "hood.pkl", rotations, pelvis)
     return folder
@@ -45,12 +45,12 @@ def motions(tmp_path_factory, body):
     ],
 )
 def test_a_foreign_garment_is_worn_on_a_foreign_motion(
-    tmp_path, worn, slip, motions, shape, motion, most_stretch, most_depth_mm
+    tmp_path, motions, shape, motion, most_stretch, most_depth_mm
 ):
     path = write_obj(tmp_path / "garment.obj", shape())
     loop = ("--loop", 40) if motion.startswith("makehuman") else ()  # it has 17 frames
     words = ("--motion", motions / motion, *loop)
-    report, run = worn(path, tmp_path / "run", *words, frames=40)
+    report, run = worn(tmp_path / "run", "--garment", path, "--frames", 40, *words)
     cloth, wearer = run["positions"], run["body_positions"]
     above = cloth[..., 1].mean(axis=1) - wearer[..., 1].mean(axis=1)
     assert abs(above[-1] - above[0]) < 0.1, "it falls off"
@@ -63,15 +63,13 @@ def test_a_foreign_garment_is_worn_on_a_foreign_motion(
 
 
 @pytest.fixture(scope="module")
-def fallen(tmp_path_factory, eslr):
+def fallen(tmp_path_factory):
     """A skirt that nothing holds, after two seconds: its folder and its trajectory."""
     folder = tmp_path_factory.mktemp("fallen")
     path = write_obj(folder / "skirt.obj", skirt())
-    fit = eslr("fit", path, "--pin", "none", "--out", folder / "skirt.npz", "--no-picture")
-    assert fit.returncode == 0, fit.stderr
-    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--settle", 0, "--no-pictures")
-    done = eslr("simulate", "--garment", folder / "skirt.npz", *words, "--out", folder / "run")
-    assert done.returncode == 0, done.stderr
+    succeeded(eslr("fit", path, "--pin", "none", "--out", folder / "skirt.npz", "--no-picture"))
+    words = ("--simulator", "physics", "--garment", folder / "skirt.npz", *TWO_SECONDS, "--no-pictures")
+    done = succeeded(eslr("simulate", *words, "--out", folder / "run"))
     with np.load(folder / "run" / "trajectory.npz") as arrays:
         return folder / "run", dict(arrays), done.stdout
 
@@ -88,13 +86,12 @@ def test_a_skirt_that_nothing_holds_ends_on_the_ground_and_is_told(fallen):
     assert "frame 6" in text
 
 
-def test_a_moment_of_a_run_becomes_a_picture(fallen, eslr, tmp_path):
+def test_a_moment_of_a_run_becomes_a_picture(fallen, tmp_path):
     folder, _, _ = fallen
     pictures = []
     for moment in ("0", "2s"):
         out = tmp_path / f"{moment}.png"
-        result = eslr("render", folder, "--out", out, "--at", moment, "--samples", 2, "--width", 120)
-        assert result.returncode == 0, result.stderr
+        succeeded(eslr("render", folder, "--out", out, "--at", moment, "--samples", 2, "--width", 120))
         pictures.append(np.asarray(Image.open(out).convert("RGB"), float))
     assert pictures[0].shape == (160, 120, 3)
     # The label stands above, in the first forty rows.
@@ -103,68 +100,22 @@ def test_a_moment_of_a_run_becomes_a_picture(fallen, eslr, tmp_path):
     assert rows[1] > rows[0] + 15, "the skirt has fallen"
 
 
-def test_a_run_goes_to_other_programs(fallen, eslr, tmp_path):
-    folder, run, _ = fallen
-    for out, words in (("run.glb", ()), ("frames", ("--format", "obj")), ("cache.pc2", ())):
-        result = eslr("export", folder, "--out", tmp_path / out, *words)
-        assert result.returncode == 0, result.stderr
-    frame = trimesh.load(sorted((tmp_path / "frames").glob("*.obj"))[30], process=False)
-    np.testing.assert_allclose(frame.vertices, run["positions"][30], atol=1e-5)
-    scene = trimesh.load(tmp_path / "run.glb", process=False)
-    cloth = min(scene.geometry.values(), key=lambda mesh: len(mesh.vertices))
-    np.testing.assert_allclose(cloth.vertices, run["positions"][0], atol=1e-5)
-    cache = (tmp_path / "cache.pc2").read_bytes()
-    points = np.frombuffer(cache[32:], "<f4").reshape(61, -1, 3)
-    np.testing.assert_allclose(points, run["positions"], atol=1e-6)
-
-
-def test_a_skirt_flies_in_the_wind_and_its_gap_is_that_of_the_windy_frames(eslr, tmp_path):
+def test_a_skirt_flies_in_the_wind_and_its_gap_is_that_of_the_windy_frames(tmp_path):
     """Gap, as a picture, is measured on the frames' own problems: with their wind, gusts and damping."""
-    words = (
-        "--simulator",
-        "physics",
-        "--iterations",
-        40,
-        "--motion",
-        "turn",
-        "--frames",
-        20,
-        "--no-pictures",
-    )
-    garment, ends = write_obj(tmp_path / "skirt.obj", skirt()), {}
-    for name, air in (("still", ()), ("windy", ("--wind", 0, 0, 8, "--gust", 0.2, "--damping", 0.002))):
-        done = eslr("simulate", "--garment", garment, *words, *air, "--out", tmp_path / name)
-        assert done.returncode == 0, done.stderr
-        with np.load(tmp_path / name / "trajectory.npz") as arrays:
-            ends[name] = arrays["positions"][-1]
-    assert (ends["windy"] - ends["still"])[:, 2].mean() > 0.02
-    report = json.loads((tmp_path / "windy" / "report.json").read_text())
+    garment = write_obj(tmp_path / "skirt.obj", skirt())
+    words = ("--garment", garment, "--iterations", 40, "--motion", "turn", "--frames", 20)
+    _, still = worn(tmp_path / "still", *words)
+    air = ("--wind", 0, 0, 8, "--gust", 0.2, "--damping", 0.002)
+    report, windy = worn(tmp_path / "windy", *words, *air)
+    assert (windy["positions"][-1] - still["positions"][-1])[:, 2].mean() > 0.02
     assert (report["wind_m_s"], report["gust"], report["damping_s"]) == ([0.0, 0.0, 8.0], 0.2, 0.002)
     gap = run_field(read_run(tmp_path / "windy"), "gap").values.sum(axis=1)
     assert gap.min() > -1e-3, "above the optimum of another problem"
 
 
-def test_a_run_without_ground_falls_below_the_feet(fallen, eslr, tmp_path):
+def test_a_run_without_ground_falls_below_the_feet(fallen, tmp_path):
     folder, _, _ = fallen
-    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--settle", 0, "--json")
     garment = ("--garment", folder.parent / "skirt.npz", "--ground", "off")
-    result = eslr("simulate", *garment, *words, "--no-pictures", "--out", tmp_path)
-    report = json.loads(result.stdout)
+    report, run = worn(tmp_path, *garment, *TWO_SECONDS)
     assert report["ground_m"] is None
-    with np.load(tmp_path / "trajectory.npz") as arrays:
-        assert arrays["positions"][-1, :, 1].min() < arrays["body_positions"][-1, :, 1].min() - 0.02
-
-
-def test_lengths_that_are_listed_are_accepted(eslr, tmp_path):
-    listed = {
-        asset["name"]: asset for asset in json.loads(eslr("assets", "--kind", "motion", "--json").stdout)
-    }
-    count = listed["cmu_016_22"]["frames"]
-    words = ("--motion", "cmu_016_22", "--simulator", "physics", "--iterations", 10)
-    words += ("--contact", "fast", "--no-pictures")  # for speed
-    refused = eslr("simulate", *words, "--frames", count + 1, "--out", tmp_path / "out")
-    assert refused.returncode == 2
-    assert f"{count} frames" in refused.stderr
-    done = eslr("simulate", *words, "--frames", count, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "out" / "report.json").read_text())["num_frames"] == count
+    assert run["positions"][-1, :, 1].min() < run["body_positions"][-1, :, 1].min() - 0.02

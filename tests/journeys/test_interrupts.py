@@ -8,7 +8,10 @@ import time
 from functools import partial
 
 import numpy as np
+import pytest
+from commands import eslr
 
+pytestmark = pytest.mark.slow
 SIMULATE = ("--simulator", "physics", "--iterations", 150, "--frames", 141, "--settle", 5, "--no-pictures")
 RECIPE = """
 garments = ["tshirt"]
@@ -41,7 +44,7 @@ def interrupt_after(seconds, *words):
     return process.returncode, text, time.monotonic() - began
 
 
-def test_a_simulation_interrupted_again_and_again_ends_as_the_whole_one(tmp_path, eslr):
+def test_a_simulation_interrupted_again_and_again_ends_as_the_whole_one(tmp_path):
     whole, part = tmp_path / "whole", tmp_path / "part"
     for _ in range(2):  # the second has everything compiled, as those that follow
         began = time.monotonic()
@@ -96,10 +99,7 @@ main()
 
 def test_ctrl_c_while_a_run_is_measured_loses_no_frame(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", STOPPED_WHILE_IT_IS_MEASURED, tmp_path / "run"],
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-c", STOPPED_WHILE_IT_IS_MEASURED, tmp_path / "run"], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert "stopping when these frames are written" in done.stderr
@@ -109,7 +109,7 @@ def test_ctrl_c_while_a_run_is_measured_loses_no_frame(tmp_path):
     assert not (tmp_path / "run" / "sheet.png").exists(), "pictures are not waited for"
 
 
-def test_a_training_stops_at_once_while_it_compiles_and_resumes(tmp_path, eslr, monkeypatch):
+def test_a_training_stops_at_once_while_it_compiles_and_resumes(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled yet
     (tmp_path / "recipe.toml").write_text(RECIPE)
     whole, part = tmp_path / "whole", tmp_path / "part"

@@ -13,7 +13,7 @@ from commands import eslr_here, refused
 from example_runs import write_run
 from garment_shapes import skirt, write_obj
 
-NAN = float("nan")
+pytestmark = pytest.mark.slow
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 BVH = """HIERARCHY
 ROOT Hips
@@ -53,36 +53,24 @@ class Danger:
 # Text, bytes, arrays of an npz, or None for a folder.
 FILES = {
     "empty.obj": "",
-    "nan.obj": "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
-    "huge.obj": "v 1e300 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
     "large.obj": "v 2e4 0 0\nv -2e4 0 0\nv 0 2e4 0\nv 0 0 2e4\nf 1 2 3\nf 1 4 2\nf 2 4 3\n",
     "point.obj": "v 0 1 0\n" * 3 + "f 1 2 3\n",
     "fan.obj": TRIANGLE + "v 0 0 1\nv 0 -1 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n",
     "folder.obj": None,
-    "cut.glb": b"glTF" + (2).to_bytes(4, "little") + (999).to_bytes(4, "little"),
-    "image.glb": b"\x89PNG\r\n\x1a\n" + b"\0" * 40,
-    "objects.npz": {"rest_positions": np.array([{}, None], dtype=object)},
     "noise.npz": "noise",
     "garment.fbx": "hello",
     "noise.pkl": b"\x80\x04noise",
     "danger.pkl": pickle.dumps({"shirt": Danger()}),
-    "shirt.pkl": pickle.dumps({"shirt": 1}),
     "good.bvh": BVH,
     "motion.abc": "hello",
     "empty.bvh": "",
     "lone.amc": ":DEGREES\n1\nroot 0 1 0 0 20 0\n",
     "one-pose.npz": POSES | {key: POSES[key][:1] for key in ("poses", "trans")},
-    "nan-poses.npz": POSES | {"poses": np.full((4, 156), NAN)},
     "clip.glb": b"glTF" + b"\0" * 20,
     "one-frame.npz": BODY | {"positions": np.zeros((1, 4, 3))},
-    "nan-body.npz": BODY | {"positions": np.full((4, 4, 3), NAN)},
     "flat-body.npz": BODY,
     "nothing": None,
-    "topologies/0.obj": TRIANGLE + "f 1 2 3\n",
-    "topologies/1.obj": TRIANGLE + "v 0 0 1\nf 1 2 4\n",
-    "words.toml": "these are words",
     "key.toml": RECIPE.replace("steps", "stepz"),
-    "type.toml": RECIPE.replace("2", '"two"'),
     "good.toml": RECIPE,
     "list.json": "[1, 2]",
     "wing.json": json.dumps({"Wing": "Hips"}),
@@ -92,9 +80,8 @@ FILES = {
 }
 # Each row: the rest of the command line, and what the line must name.
 FIT = {
-    "empty.obj": "empty", "nan.obj": "finite", "huge.obj": "", "large.obj": "m, cm, mm, in", "point.obj": "",
-    "fan.obj": "edge", "folder.obj": "", "cut.glb": "", "objects.npz": "", "noise.npz": "", "garment.fbx": "obj",
-    "noise.pkl": "", "danger.pkl": "", "shirt.pkl#skirt": "",
+    "empty.obj": "empty", "large.obj": "m, cm, mm, in", "point.obj": "", "fan.obj": "edge", "folder.obj": "",
+    "garment.fbx": "obj", "danger.pkl": "",
     "skirt.obj --units -1": "positive", "skirt.obj --edge-length 0": "edge", "skirt.obj --weld nan": "weld",
     "skirt.obj --pin vertices:99999": "99999", "skirt.obj --pin region:y>1.2.3": "y>1.2.3",
     "skirt.obj --pin part:collar": "no such part", "skirt.obj --fabric denin": "did you mean denim",
@@ -106,13 +93,13 @@ FIT = {
 }  # fmt: skip
 SIMULATE = {
     **{f"--motion {file}": cause for file, cause in {
-        "empty.bvh": "", "lone.amc": "asf", "one-pose.npz": "", "nan-poses.npz": "finite", "noise.pkl": "",
-        "folder.obj": "", "garment.fbx": "glTF", "motion.abc": ".bvh", "clip.glb#run": "",
-        "moonwalk": "cmu_016_32", "turn --motion jump": "--motion is given twice",
+        "empty.bvh": "", "lone.amc": "asf", "one-pose.npz": "", "noise.pkl": "", "garment.fbx": "glTF",
+        "motion.abc": ".bvh", "clip.glb#run": "", "moonwalk": "cmu_016_32",
+        "turn --motion jump": "--motion is given twice",
     }.items()},
     **{f"--body {file}": cause for file, cause in {
-        "one-frame.npz": "", "nan-body.npz": "finite", "garment.fbx": "", "nothing": "", "topologies": "",
-        "noise.pkl": "", "image.glb": "", "robot": "anny",
+        "flat-body.npz --motion turn": "follows no other", "one-frame.npz": "",
+        "garment.fbx": "", "nothing": "", "noise.pkl": "", "robot": "anny",
     }.items()},
     "--garment tshrit": "tshirt", "--garment missing.obj": "missing.obj", "--garment empty.obj": "empty",
     "--garment tshirt --garment tshirt": "worn once only",
@@ -134,12 +121,11 @@ SIMULATE = {
     "--joint-map wing.json --motion good.bvh": "Wing", "--arm-abduction nan": "", "--arm-abduction 1e9": "",
     "--body-fps 30": "--body-fps", "--betas " + "1 " * 99: "betas", "--body-units cm": "metres",
     "--resume": "no interrupted simulation", "--resume --out damaged": "unfinished.npz",
-    "--out key.toml": "is a file", "--frames 2 --out key.toml/out": "key.toml",
+    "--frames 2 --settle 0 --iterations 1 --contact fast --out key.toml": "is a file",
 }  # fmt: skip
 TRAIN = {
     "": "--out", "--out t": "--config", "--config missing.toml --out t": "missing.toml",
-    "--config words.toml --out t": "words.toml", "--config key.toml --out t": "stepz",
-    "--config type.toml --out t": "steps", "--config run --out t": "run",
+    "--config key.toml --out t": "stepz", "--config run --out t": "run",
     "--config good.toml --set steps=-1 --out t": "steps", "--config good.toml --set steps --out t": "key=value",
     "--config good.toml --set 'garments=[\"tshrit\"]' --tensorboard --out t": "tshrit",
     "--config good.toml --num-processes 2 --process-id 1 --out t": "--coordinator",

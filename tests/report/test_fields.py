@@ -9,6 +9,7 @@ import pytest
 from cloth import make_limb
 from draped_ball import drifting_ball, square
 from example_runs import write_run as write_run_by_hand
+from garment_files import stored
 from own_term import Push
 
 from eslr_jax import (
@@ -20,7 +21,6 @@ from eslr_jax import (
     scene_terms,
     score_trajectory,
 )
-from eslr_jax.pipeline.formats.garment import GarmentFile
 from eslr_jax.pipeline.report.fields import energy_shares, gap_shares, run_field
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_poses, run_trajectory, write_run
 from eslr_jax.simulation.frame import first_problem
@@ -86,15 +86,9 @@ def test_a_run_with_an_energy_of_ones_own_is_scored_from_its_files(tmp_path, sma
     terms = scene_terms(Gravity(1.62), Push(2.0))
     scene = prepare_scene(small_garment, small_poses, terms=terms, integrator="bdf2")
     whole = rollout_scene(None, scene, SimConfig(iterations=60))
-    weights = np.ones((scene.garment.vertex_mask.size, 1))
-    stored = GarmentFile(
-        *map(np.asarray, (scene.garment.rest_positions, scene.garment.faces)),
-        weights,
-        np.zeros_like(weights, int),
-        np.asarray(scene.garment.is_pinned),
-    )
+    garment = stored(*map(np.asarray, (scene.garment.rest_positions, scene.garment.faces)))
     track = ClothTrack(whole.positions, whole.velocities, whole.friction_loads, whole.residuals)
-    write_run(tmp_path, track, scene, (make_limb(), small_poses, stored), report={})
+    write_run(tmp_path, track, scene, (make_limb(), small_poses, garment), report={})
     run = read_run(tmp_path)
     jax.tree.map(np.testing.assert_array_equal, run.scene, scene)
     scores = [

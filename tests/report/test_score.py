@@ -15,8 +15,6 @@ from eslr_jax import (
     score_trajectory,
     simulate,
 )
-from eslr_jax.networks.eslr import Eslr
-from eslr_jax.pipeline.report.evaluate import EvaluationOptions, evaluate
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.pipeline.report.report import trajectory_report
 from eslr_jax.pipeline.report.score import foreign_trajectory, with_energies
@@ -97,34 +95,3 @@ def test_what_is_no_trajectory_of_the_scene_is_refused(small_scene):
     positions[4, 0] = np.nan
     with pytest.raises(NonFiniteError, match="frame 4"):
         score_trajectory(positions, small_scene)
-
-
-@pytest.mark.slow
-def test_a_network_s_rollout_scores_as_evaluate_says():
-    from eslr_jax import load_body, load_garment, load_motion, pose_body
-    from eslr_jax.simulation.plan import shared_surface
-
-    network = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8).new_network()
-    frames, every = 6, 2
-    options = EvaluationOptions(
-        garments=("tshirt",), clips=("cmu_016_32",), gap_frames=frames, every=every, rollout_frames=4
-    )
-    expected = evaluate(network, options, iterations=5)["on_policy"]
-    body, garment = load_body(), load_garment("tshirt", pad=True)
-    poses = pose_body(body, load_motion("cmu_016_32"), num_frames=frames)
-    scene = prepare_scene(garment, poses, surface=shared_surface([garment], body))
-    own = simulate(network, scene, config=SimConfig(iterations=5)).trajectory
-    score = score_trajectory(own, scene, every=every)
-    assert score["gap_frames"] == expected["frames"]
-    assert score["gap_relative_median"] == pytest.approx(expected["gap_relative_median"], rel=0.02)
-    assert score["gap_median_j"] == pytest.approx(expected["gap_median_j"], rel=0.02)
-
-
-@pytest.mark.slow
-def test_an_evaluation_without_the_gap_has_the_rollouts():
-    network = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8).new_network()
-    options = EvaluationOptions(garments=("tshirt",), clips=("cmu_016_32",), gap_frames=0, rollout_frames=4)
-    result = evaluate(network, options)
-    assert not {"gap_median_j", "on_policy"} & set(result)
-    assert [(row["garment"], row["clip"]) for row in result["scenes"]] == [("tshirt", "cmu_016_32")]
-    assert result["rollout"]["drift_mm_s_of"].keys() == {"tshirt"}

@@ -5,7 +5,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cloth import make_sheet
+from cloth import dented_sheets
 from draped_ball import RADIUS, ball, drifting_ball, square
 from hard_cases.build import make_cloth, make_scene
 
@@ -114,12 +114,7 @@ def test_cloth_through_cloth_is_told_where_it_is_modelled(worn):
 
 @pytest.mark.parametrize(("dent", "is_told"), [(0.0, False), (0.02, True), (0.05, True)])
 def test_a_start_with_cloth_deep_behind_cloth_is_told_with_its_place(dent, is_told):
-    """Two sheets a centimetre apart, the middle of the upper one pushed down through the lower one."""
-    flat, faces = make_sheet(13, 13, 0.02, jitter=0.1)
-    flat = flat - flat.mean(axis=0)
-    upper = flat + np.array([0.003, 0.01, 0.004])
-    upper[:, 1] -= dent * np.exp(-np.sum(upper[:, [0, 2]] ** 2, axis=1) / (2 * 0.04**2))
-    start, faces = np.concatenate([flat, upper]), np.concatenate([faces, faces + len(flat)])
+    start, faces = dented_sheets(dent)
     scene = make_scene(make_cloth((start, faces), {}, allow_components=True), start, 2, self_contact=True)
     parts = (np.repeat([0, 1], len(faces) // 2), ("skirt", "coat"))
     text = describe_start(start_crossing(scene, parts=parts), is_put_on=False)

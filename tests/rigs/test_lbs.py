@@ -97,15 +97,6 @@ def test_skin_is_equivariant_to_moving_and_turning_the_root(rng):
     np.testing.assert_allclose(there, turn.apply(np.asarray(here)) + offset, atol=3e-6)
 
 
-def test_whole_turns_change_nothing(rng):
-    rotations, translation, joints = random_tree(rng)
-    lengths = jnp.linalg.norm(rotations, axis=1, keepdims=True)
-    further = rotations * (1.0 + 2.0 * jnp.pi / lengths)
-    one = joint_transforms(rotations, translation, joints, TREE)
-    other = joint_transforms(further, translation, joints, TREE)
-    np.testing.assert_allclose(other, one, atol=1e-5)
-
-
 def test_gradients_are_finite_at_the_rest_pose(rng):
     _, translation, joints = random_tree(rng)
     skin = random_skin(rng)

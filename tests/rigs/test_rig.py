@@ -7,18 +7,20 @@ import warnings
 import jax
 import numpy as np
 import pytest
+import trimesh
 from cloth import turn_about
+from foreign_files import moving, posed_joints, rigged
 from scipy.spatial.transform import Rotation
 
 from eslr_jax import AssetError, MeshError, MotionError, load_motion, pose_body
 from eslr_jax.pipeline.assets.motions import read_joint_map
 from eslr_jax.pipeline.rigs.clothing import body_pieces
 from eslr_jax.pipeline.rigs.procedural import PROCEDURAL
-from eslr_jax.pipeline.rigs.rig import body_skeleton, hips_first, make_body, make_motion, skeleton_motion
-from eslr_jax.pose.joints import find_named_parts, find_parts, map_joints, torso_axes
+from eslr_jax.pipeline.rigs.rig import body_skeleton, hips_first, make_body, make_motion
+from eslr_jax.pose.joints import find_named_parts, find_parts, map_joints
 from eslr_jax.pose.motion import obstacle_surface, still_motion
 from eslr_jax.pose.retarget import global_rotations
-from eslr_jax.pose.skeleton import RiggedMesh, Skeleton
+from eslr_jax.pose.skeleton import Skeleton
 
 RIGS = {
     "Mixamo": """
@@ -111,11 +113,8 @@ def test_limbs_that_follow_nothing_are_named(walking, body):
     names = list(walking.skeleton.joint_names)
     joint = names.index("LeftForeArm")
     names[joint : joint + 5] = ["box"] * 5
-    partial = dataclasses.replace(
-        walking.skeleton,
-        joint_names=tuple(f"{name}.{k}" if name == "box" else name for k, name in enumerate(names)),
-    )
-    source = dataclasses.replace(walking, skeleton=partial)
+    renamed = tuple(f"{name}.{k}" if name == "box" else name for k, name in enumerate(names))
+    source = dataclasses.replace(walking, skeleton=dataclasses.replace(walking.skeleton, joint_names=renamed))
     with pytest.warns(
         UserWarning, match="no joint of it is known as left forearm, which move with.*joint-map"
     ):
@@ -149,17 +148,6 @@ def test_the_map_can_be_changed(tmp_path, body):
             read_joint_map(path)
 
 
-def test_hips_above_which_there_is_a_root_become_the_first_joint():
-    rest = np.array([[0, 0, 0], [0, 1, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0, 1.3, 0.0]])
-    skeleton = Skeleton(("root", "pelvis", "thigh_l", "thigh_r", "spine_01"), (-1, 0, 1, 1, 1), rest)
-    found, order = hips_first(skeleton)
-    assert found.joint_names[0] == "pelvis"
-    assert found.parents[0] == -1
-    assert all(parent < joint for joint, parent in enumerate(found.parents))
-    np.testing.assert_array_equal(found.rest_positions, rest[order])
-    np.testing.assert_allclose(torso_axes(found, find_parts(found)), np.eye(3), atol=1e-12)
-
-
 def test_joints_of_one_rig_follow_by_name_whatever_their_order():
     """Two toes of two links: a file lists toe by toe, and a body, made from the hips outwards, link by link."""
     thighs, toes = ["Bip01 L Thigh", "Bip01 R Thigh"], ("Toe0", "Toe01", "Toe1", "Toe11")
@@ -176,11 +164,7 @@ def test_joints_of_one_rig_follow_by_name_whatever_their_order():
 @pytest.fixture(scope="module")
 def walking(body):
     """The default clip as the moving skeleton of a file."""
-    return skeleton_motion(load_motion(), body)
-
-
-def posed_joints(motion, body):
-    return skeleton_motion(motion, body).positions
+    return moving(body)
 
 
 def test_a_motion_of_nameless_joints_is_refused(walking, body):
@@ -324,32 +308,14 @@ def test_a_figure_that_lies_in_its_motion_alone_is_told_to_be_taken_as_z_up(walk
         make_motion(walking, body, up="auto")
 
 
-def test_a_character_that_is_inside_out_is_refused(body):
-    mesh = RiggedMesh(
-        name="hero",
-        positions=np.asarray(body.rest_positions, np.float64),
-        faces=np.asarray(body.faces),
-        skin_weights=np.asarray(body.skin_weights, np.float64),
-        skin_indices=np.asarray(body.skin_indices),
-        skeleton=body_skeleton(body),
-    )
+def test_a_character_that_is_inside_out_or_of_hands_alone_is_refused(body):
+    mesh = rigged(body)
     make_body(mesh)
     with pytest.raises(MeshError, match="body hero: its faces point inside; flip the normals"):
         make_body(dataclasses.replace(mesh, faces=mesh.faces[:, ::-1]))
-
-
-def test_a_character_of_hands_alone_is_refused(body):
-    hand = body.joint_names.index("LeftHand")
-    mesh = RiggedMesh(
-        name="glove",
-        positions=np.asarray(body.rest_positions, np.float64),
-        faces=np.asarray(body.faces),
-        skin_weights=np.ones((len(body.rest_positions), 1)),
-        skin_indices=np.full((len(body.rest_positions), 1), hand),
-        skeleton=body_skeleton(body),
-    )
+    hands = np.full((len(mesh.positions), 1), body.joint_names.index("LeftHand"))
     with pytest.raises(AssetError, match="body glove is hands alone; bind its other meshes"):
-        make_body(mesh)
+        make_body(rigged(body, name="glove", skin_weights=np.ones(hands.shape), skin_indices=hands))
 
 
 def test_only_a_bvh_is_told_which_axis_points_up(body):
@@ -382,20 +348,16 @@ def pieces(body):
     return {piece.name: piece for piece in body_pieces(positions, faces, body)}
 
 
-def area(points, faces):
-    corners = points[faces]
-    return (
-        0.5
-        * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    )
-
-
 def test_pieces_are_the_body_s_surface(body, pieces):
     positions, faces = np.asarray(body.rest_positions, np.float64), np.asarray(body.faces)
     assert set(pieces) == {"skin", "top", "shorts"}
-    total = sum(area(piece.place(positions).astype(float), piece.faces) for piece in pieces.values())
-    assert total == pytest.approx(area(positions, faces), rel=1e-4)
-    sides = {name: area(piece.place(positions), piece.faces) / total for name, piece in pieces.items()}
+    areas = {
+        name: trimesh.Trimesh(piece.place(positions), piece.faces, process=False).area
+        for name, piece in pieces.items()
+    }
+    total = sum(areas.values())
+    assert total == pytest.approx(trimesh.Trimesh(positions, faces, process=False).area, rel=1e-4)
+    sides = {name: area / total for name, area in areas.items()}
     assert 0.1 < sides["top"] < 0.35
     assert 0.1 < sides["shorts"] < 0.3
 

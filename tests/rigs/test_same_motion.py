@@ -1,11 +1,13 @@
 """One motion, a CMU clip, through every loader of motions: the body's joints are at the same places."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from foreign_files import (
     Z_UP_FROM_Y_UP,
+    posed_joints,
     smpl_parameters,
     write_amass,
     write_bvh,
@@ -16,10 +18,7 @@ from foreign_files import (
 from scipy.spatial.transform import Rotation
 
 from eslr_jax import load_motion
-from eslr_jax.files.npz import write_arrays
-from eslr_jax.pipeline.formats.bvh import read_bvh
-from eslr_jax.pipeline.rigs.rig import skeleton_motion
-from eslr_jax.pose.timing import skip_start_pose
+from eslr_jax.pipeline.formats.registry import find_reader
 
 CLIP = Path(__file__).parents[1] / "fixtures" / "cmu_01_01.bvh"  # 120 frames at 30 Hz of CMU 01_01, a jump
 TOLERANCE = 0.01  # [m]
@@ -51,7 +50,8 @@ def unreal(name):
 
 @pytest.fixture(scope="module")
 def clip():
-    return skip_start_pose(read_bvh(CLIP))[0]
+    whole = find_reader("motion", CLIP)(CLIP)
+    return replace(whole, rotations=whole.rotations[1:], positions=whole.positions[1:])  # but its T-pose
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def own_motion(body):
 
 @pytest.fixture(scope="module")
 def expected(own_motion, body):
-    return skeleton_motion(own_motion, body).positions
+    return posed_joints(own_motion, body)
 
 
 def write_same(kind, folder, clip, own):
@@ -85,7 +85,7 @@ def write_same(kind, folder, clip, own):
         write_vto(path, rotations, pelvis)
     elif kind == "archive npz":
         arrays = {"joint_names": np.array(own.joint_names), "a/fps": np.array(own.fps)}
-        write_arrays(path, arrays | {"a/rotations": own.rotations, "a/translations": own.translations})
+        np.savez(path, **arrays, **{"a/rotations": own.rotations, "a/translations": own.translations})
     elif kind.endswith("bvh"):
         options = {
             "centimetres, Z up bvh": {"unit": 6.158, "axes": Z_UP_FROM_Y_UP},
@@ -98,25 +98,15 @@ def write_same(kind, folder, clip, own):
         }
         write_bvh(path, clip, **options[kind])
     else:
-        count = len(clip.skeleton)
-        options = {}
+        frames = None
         if kind.startswith("turned bones"):
-            turns = np.random.default_rng(0).normal(size=(count, 3))
-            options = {"frames": Rotation.from_rotvec(turns).as_matrix()}
+            frames = Rotation.from_rotvec(np.random.default_rng(0).normal(size=(31, 3))).as_matrix()
         metres = 0.06158  # per unit of this BVH
-        skeleton = type(clip.skeleton)(
-            clip.skeleton.joint_names, clip.skeleton.parents, metres * clip.skeleton.rest_positions
-        )
-        write_character(
-            path,
-            skeleton,
-            skeleton.rest_positions[:3] + np.eye(3),
-            np.array([[0, 1, 2]]),
-            np.tile([1.0, 0, 0, 0], (3, 1)),
-            np.zeros((3, 4), int),
-            motion=(clip.rotations, metres * clip.positions),
-            **options,
-        )
+        skeleton = replace(clip.skeleton, rest_positions=metres * clip.skeleton.rest_positions)
+        triangle = skeleton.rest_positions[:3] + np.eye(3), np.array([[0, 1, 2]])
+        skin = np.tile([1.0, 0, 0, 0], (3, 1)), np.zeros((3, 4), int)
+        motion = clip.rotations, metres * clip.positions
+        write_character(path, skeleton, *triangle, *skin, motion=motion, frames=frames)
     return path
 
 
@@ -131,7 +121,7 @@ KINDS = (
 def test_the_same_clip_puts_joints_at_the_same_places(kind, tmp_path, clip, body, own_motion, expected):
     motion = load_motion(write_same(kind, tmp_path, clip, own_motion), body=body)
     assert motion.fps == pytest.approx(30.0, rel=1e-4)
-    found = skeleton_motion(motion, body).positions
+    found = posed_joints(motion, body)
     assert found.shape == expected.shape
     distance = np.linalg.norm(found - expected, axis=-1).max(axis=0)
     compared = [
@@ -150,7 +140,7 @@ def test_a_motion_of_smpl_that_is_y_up_stands(tmp_path, clip, body, expected):
         guessed = load_motion(path, body=body)
     compared = [joint for joint, name in enumerate(body.joint_names) if name not in NOT_IN_SMPL]
     for motion in (guessed, load_motion(path, body=body, up="y")):
-        found = skeleton_motion(motion, body).positions
+        found = posed_joints(motion, body)
         assert np.linalg.norm(found - expected, axis=-1)[:, compared].max() < TOLERANCE
 
 

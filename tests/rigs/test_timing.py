@@ -5,11 +5,10 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from foreign_files import write_bvh
+from foreign_files import moving, posed_joints, write_bvh
 
 from eslr_jax import MotionError, load_motion, pose_body
 from eslr_jax.pipeline.assets import asset_names
-from eslr_jax.pipeline.rigs.rig import skeleton_motion
 from eslr_jax.pose.motion import still_motion
 from eslr_jax.pose.retarget import count_resampled, global_rotations
 from eslr_jax.pose.timing import check_speed, cut_start, loop_motion, skip_start_pose, with_settling
@@ -17,7 +16,7 @@ from eslr_jax.pose.timing import check_speed, cut_start, loop_motion, skip_start
 
 @pytest.fixture(scope="module")
 def walking(body):
-    return skeleton_motion(load_motion("cmu_016_32"), body)
+    return moving(body)
 
 
 def with_rest_pose_first(source, frames, offset=(0.0, 0.0, 0.0)):
@@ -51,7 +50,7 @@ def test_a_motion_knows_when_it_begins_in_its_file(walking, body, tmp_path):
 
 
 def test_a_motion_without_a_rest_pose_is_kept(walking, body):
-    for source in (walking, skeleton_motion(load_motion("jump", body=body), body)):
+    for source in (walking, moving(body, "jump")):
         kept, text = skip_start_pose(source)
         assert kept is source
         assert text == ""
@@ -81,7 +80,7 @@ def test_a_repeated_walk_goes_on_without_a_jump(body):
     length = (len(motion.rotations) - 1) / motion.fps
     looped = loop_motion(motion, 3 * length)
     assert len(looped.rotations) == round(3 * length * motion.fps) + 1
-    once, thrice = (skeleton_motion(each, body).positions for each in (motion, looped))
+    once, thrice = (posed_joints(each, body) for each in (motion, looped))
     steps, longest = (
         np.linalg.norm(np.diff(positions, axis=0), axis=-1).max() for positions in (thrice, once)
     )
@@ -152,7 +151,7 @@ def test_a_body_that_is_too_fast_is_named_with_its_frame(walk):
 
 @pytest.fixture(scope="module")
 def clips(body):
-    return [(load_motion(name), skeleton_motion(load_motion(name), body)) for name in asset_names("motion")]
+    return [(load_motion(name), moving(body, name)) for name in asset_names("motion")]
 
 
 def test_clips_start_at_the_origin_on_the_floor_facing_front(clips, body):

@@ -6,18 +6,15 @@ import warnings
 
 import numpy as np
 import pytest
+from foreign_files import moving, rigged
 
 from eslr_jax import AssetError, ConfigError, load_body, load_motion
 from eslr_jax.pipeline.rigs.rig import (
     UnitsWarning,
-    body_skeleton,
     make_body,
     make_motion,
     metres_per_unit,
-    skeleton_motion,
 )
-from eslr_jax.pose.motion import shape_body
-from eslr_jax.pose.skeleton import RiggedMesh
 
 
 @pytest.mark.parametrize(
@@ -50,21 +47,11 @@ def test_no_unit_is_refused(extent, units):
 def test_a_character_in_centimetres_moves_as_in_metres(body):
     """The motion of its file is in centimetres too, and still its own."""
     motion = load_motion("cmu_016_32")
-    source = skeleton_motion(motion, body)
+    source = moving(body)
     skeleton = dataclasses.replace(source.skeleton, rest_positions=100 * source.skeleton.rest_positions)
-    mesh = RiggedMesh(
-        "character",
-        100 * np.asarray(body.rest_positions, np.float64),
-        np.asarray(body.faces),
-        np.asarray(body.skin_weights),
-        np.asarray(body.skin_indices),
-        skeleton,
-    )
     with pytest.warns(UnitsWarning, match="in cm"):
-        character = make_body(mesh)
-    np.testing.assert_allclose(
-        body_skeleton(character).rest_positions, body_skeleton(body).rest_positions, atol=1e-6
-    )
+        character = make_body(rigged(body, positions=100 * rigged(body).positions, skeleton=skeleton))
+    np.testing.assert_allclose(character.joint_rest_positions, body.joint_rest_positions, atol=1e-6)
     moved = make_motion(
         dataclasses.replace(source, skeleton=skeleton, positions=100 * source.positions), character
     )
@@ -89,6 +76,6 @@ def test_a_shape_moves_vertices_and_joints_along_its_directions(body):
 
 
 @pytest.mark.parametrize("betas", [np.zeros(1000), [np.nan]])
-def test_shapes_that_a_body_lacks_are_refused(body, betas):
+def test_shapes_that_a_body_lacks_are_refused(betas):
     with pytest.raises(ConfigError, match="betas"):
-        shape_body(body, betas)
+        load_body(betas=betas)
