@@ -28,12 +28,9 @@ Graph = list[set[int]]  # neighbours of every vertex
 
 
 def add_coarse_edges(garment: Garment) -> Garment:
-    """Return a garment with the coarse edges that a hierarchical network reads.
+    """Return a prepared garment, NumPy or JAX, with the coarse edges that a hierarchical network reads.
 
-    A padded garment gets padded coarse edges, of sizes that follow from its number of mesh edges.
-
-    Args:
-        garment: A prepared garment, which is not padded afterwards; NumPy or JAX leaves.
+    A padded garment gets padded coarse edges, of sizes that follow from its number of mesh edges; pad it first.
     """
     mask = np.asarray(garment.edge_mask)
     pairs = np.stack([np.asarray(garment.senders)[mask], np.asarray(garment.receivers)[mask]], axis=1)

@@ -58,15 +58,10 @@ def warp_directions(
 ) -> Float[np.ndarray, "faces 2"]:
     """Return the direction of the warp on every real face: a unit vector in the frame of `rest_corners`.
 
-    Patterns are cut and drawn with the warp along the second texture coordinate. Without texture coordinates,
-    or where a face has none, the warp runs along a direction laid onto the rest mesh: by default up, as in a
-    garment whose pieces hang along the grain. A face that lies across it takes the mean of the faces around
-    it, or if there is none its own first edge.
-
-    Args:
-        garment: Prepared garment.
-        corner_uvs: Texture coordinates of the corners of its faces.
-        direction: Where the warp runs without them, any length.
+    Patterns are cut and drawn with the warp along the second texture coordinate, here of the corners of the
+    garment's faces. Without texture coordinates, or where a face has none, the warp runs along a direction laid
+    onto the rest mesh: by default up, as in a garment whose pieces hang along the grain. A face that lies across
+    it takes the mean of the faces around it, or if there is none its own first edge.
 
     Raises:
         MeshError: The texture coordinates fit another mesh, or the direction is no direction.

@@ -47,7 +47,7 @@ def prepare_garment(
         panel_corners: Corners of each face in the plane of the panel that it was cut from [m], shape
             [faces, 3, 2], where that measures lengths, areas and angles instead.
         embedding_size: Number of coordinates of the geodesic embedding.
-        embedding_mode: Kind of geodesic embedding; see `embedding.geodesic_embedding`.
+        embedding_mode: Its kind; see `embedding.geodesic_embedding`.
         allow_components: Accept a mesh of several connected components.
         pad: Pad to the garment's bucket.
         name: Name of the garment in messages.
@@ -77,14 +77,13 @@ def prepare_garment(
     skin_indices = np.asarray(skin_indices)
     _check_rows(name, num_vertices, skin_weights, skin_indices)
 
-    corners = sewn[faces]
+    corners, apart = sewn[faces], np.arange(3 * len(faces)).reshape(-1, 3)
     if panel_corners is not None:
         if np.shape(panel_corners) != (len(faces), 3, 2):
             raise MeshError(f"{name}: panel corners {np.shape(panel_corners)} do not fit {len(faces)} faces")
         corners = np.pad(np.asarray(panel_corners, np.float64), ((0, 0), (0, 0), (0, 1)))
-    points, apart = corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-    if panel_corners is not None:
-        validate_lengths(points, apart, name=f"{name}, as cut")
+        validate_lengths(corners.reshape(-1, 3), apart, name=f"{name}, as cut")
+    points = corners.reshape(-1, 3)
     areas = topology.face_areas(points, apart)
     hinges, hinge_faces = topology.find_hinges(faces)
     sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2).ravel()
@@ -126,10 +125,8 @@ def prepare_garment(
 def pad_alike(garments: Sequence[Garment], bucket: padding.Bucket | None = None) -> list[Garment]:
     """Pad garments to one bucket, so that they share compiled functions and can be stacked.
 
-    Args:
-        garments: Unpadded garments; those with coarse edges get them anew, padded too. Their materials are left
-            out.
-        bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
+    The bucket is by default the smallest that holds all garments and a spare vertex. Their coarse edges are made
+    anew, padded too, and their materials left out.
     """
     if bucket is None:
         bucket = padding.common_bucket([padding.garment_bucket(garment) for garment in garments])

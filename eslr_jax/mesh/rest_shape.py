@@ -12,15 +12,11 @@ from eslr_jax.types import Garment
 def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices 3"]) -> Garment:
     """Return a garment whose lengths, areas and angles are measured on other rest positions.
 
-    `prepare_garment` computes the same on the host, in float64. This one is for gradients with respect to the
-    shape that a garment is cut to; topology, skinning and embedding stay. Warp and weft stay where they are in
-    every face. Bending in N m does not follow: a `Plate` holds the shape that it was prepared for, and energies
-    of the new garment refuse it with a ConfigError. Describe bending by `bending_stiffness`.
-
-    Args:
-        garment: A prepared garment.
-        rest_positions: The new shape [m], shape [vertices, 3]: `garment.sewn_positions`, changed. The place from
-            which the garment is skinned moves as much.
+    These are `garment.sewn_positions`, changed [m], shape [vertices, 3]; the place from which the garment is
+    skinned moves as much. `prepare_garment` computes the same on the host, in float64. This one is for gradients
+    with respect to the shape that a garment is cut to; topology, skinning and embedding stay. Warp and weft stay
+    where they are in every face. Bending in N m does not follow: a `Plate` holds the shape that it was prepared
+    for, and energies of the new garment refuse it with a ConfigError. Describe bending by `bending_stiffness`.
     """
     is_real = garment.rest_areas > 0
     areas = jnp.where(is_real, _areas(rest_positions, garment.faces), 0.0)

@@ -239,11 +239,7 @@ def validate_body(
 def check_outward(
     positions: Float[np.ndarray, "body_vertices 3"], faces: Int[np.ndarray, "body_faces 3"], *, name: str
 ) -> None:
-    """Check that the faces of a body, which may have holes, point outside.
-
-    Raises:
-        MeshError: They enclose a negative volume.
-    """
+    """Raise a MeshError where the faces of a body, which may have holes, enclose a negative volume."""
     volume = np.sum(np.linalg.det(positions[faces] - positions.mean(axis=0))) / 6
     if volume < -_FLAT * np.ptp(positions, axis=0).max() ** 3:
         raise MeshError(f"{name}: its faces point inside; flip the normals")

@@ -34,7 +34,8 @@ def apply_model(
     network: Network, graph: jraph.GraphsTuple, garment: Garment
 ) -> Float[Array, "vertices outputs"]:
     """Return the network's raw output for a graph of `build_graph`, of the network's kind; see `scale_output`."""
-    return _call(network, graph, network.statistics, _places(garment))
+    places = Places(garment.geodesic_embedding, garment.vertex_mask)
+    return _call(network, graph, network.statistics, places)
 
 
 def encode_frame(network: Network, graph: jraph.GraphsTuple) -> Any:
@@ -49,11 +50,8 @@ def apply_refinement(
 
     `encoded` is the result of `encode_frame`, and `changing` a graph of `build_refinement_graph`.
     """
-    return _call(network, encoded, _places(garment), changing, method="process")
-
-
-def _places(garment: Garment) -> Places:
-    return Places(garment.geodesic_embedding, garment.vertex_mask)
+    places = Places(garment.geodesic_embedding, garment.vertex_mask)
+    return _call(network, encoded, places, changing, method="process")
 
 
 def _call(network: Network, *args: Any, **options: Any) -> Any:

@@ -130,7 +130,7 @@ def build_frame_graph(
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
             body = features.hood_body_features(contacts, inputs.timestep)
             world = features.hood_world_features(contacts, inputs, reads_state=kind.reads_state)
-        nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
+        nodes["body"], edges["world"] = (jnp.where(mask[:, None], rows, 0) for rows in (body, world))
         senders["world"] = jnp.arange(mask.shape[0])
         receivers["world"] = senders["world"] % count
         if kind.has_reverse_edges:
@@ -174,7 +174,7 @@ def build_refinement_graph(
     }
     if inputs.contacts is not None:
         world = features.refinement_world_features(inputs.guess, inputs.contacts)
-        edges["world"] = _mask_rows(world, frame_graph.globals["world_mask"])
+        edges["world"] = jnp.where(frame_graph.globals["world_mask"][:, None], world, 0)
         if "world_reverse" in frame_graph.edges:
             edges["world_reverse"] = edges["world"]  # distances have no direction
     return frame_graph._replace(nodes=nodes, edges=edges)
@@ -221,10 +221,3 @@ def incoming_edges(
     first = jnp.cumsum(degrees) - degrees
     edges = first[:, None] + jnp.arange(neighbor_mask.shape[1], dtype=jnp.int32)[None]
     return jnp.where(neighbor_mask, edges, num_edges)
-
-
-def _mask_rows(
-    rows: Float[Array, "rows features"], mask: Bool[Array, " rows"]
-) -> Float[Array, "rows features"]:
-    """Return `rows` with zeros where `mask` is False."""
-    return jnp.where(mask[:, None], rows, 0)

@@ -91,15 +91,17 @@ class GraphModule(nn.Module):
 
     def with_types(self, graph: jraph.GraphsTuple) -> Rows:
         """Return the node features with the embedding of the vertex type behind the velocity, as in HOOD."""
+        return {
+            name: embedded(rows, VELOCITY_COLUMNS, self.type_embedding, graph.globals[f"{name}_type"])
+            for name, rows in cast(Rows, graph.nodes).items()
+        }
 
-        def insert(rows: Float[Array, "_ 11"], types: Int[Array, " _"]) -> Float[Array, "_ 20"]:
-            embedding = self.type_embedding.astype(rows.dtype)[types]
-            return jnp.concatenate(
-                [rows[:, :VELOCITY_COLUMNS], embedding, rows[:, VELOCITY_COLUMNS:]], axis=1
-            )
 
-        nodes = cast(Rows, graph.nodes)
-        return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in nodes.items()}
+def embedded(
+    rows: Float[Array, "_ features"], column: int, table: Float[Array, "types size"], types: Int[Array, " _"]
+) -> Float[Array, "_ more_features"]:
+    """Return rows with the embedding of their types, of a table, in front of a column."""
+    return jnp.concatenate([rows[:, :column], table.astype(rows.dtype)[types], rows[:, column:]], axis=1)
 
 
 class EncodeProcessDecode(GraphModule):

@@ -21,10 +21,7 @@ ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bund
 
 
 def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArray:
-    """Return local axis-angle rotations [rad], shape [frames, joints, 3].
-
-    `global_rotations` are matrices since the rest pose, shape [frames, joints, 3, 3].
-    """
+    """Return local axis-angle rotations [rad] of matrices since the rest pose, shape [frames, joints, 3, 3]."""
     local = np.array(global_rotations, dtype=np.float64)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -113,10 +110,7 @@ def interpolate(
 
 
 def blend_rotations(start: NDArray, end: NDArray, fraction: NDArray) -> NDArray:
-    """Return rotations between two, along the shorter way, shape [frames, joints, 3] [rad].
-
-    `fraction` is the share of the way from `start` to `end`, shape [frames].
-    """
+    """Return rotations at a share of the way between two, the shorter way [rad], shape [frames, joints, 3]."""
     first, last = (Rotation.from_rotvec(np.reshape(values, (-1, 3))) for values in (start, end))
     step = (first.inv() * last).as_rotvec() * np.repeat(fraction, start.shape[1])[:, None]
     return (first * Rotation.from_rotvec(step)).as_rotvec().reshape(start.shape)

@@ -121,10 +121,9 @@ def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) 
 
     Args:
         poses: The body in motion.
-        num_frames: Number of frames to put before it; drop as many from the result. With fewer than 25 there is
-            no time for the limbs, and all hold the first pose.
-        body: Whose motion it is. Without it, and for a mesh in motion, which has no skeleton, all hold the first
-            pose.
+        num_frames: Number of frames to put before it; drop as many from the result.
+        body: Whose motion it is. Without it, for a mesh in motion, which has no skeleton, and with fewer than 25
+            frames, all hold the first pose.
 
     Raises:
         MotionError: The number is negative, or the motion has fewer than two frames.
@@ -146,10 +145,7 @@ def begins_at_rest(num_frames: int, body: Body) -> bool:
 
 
 def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:
-    """Return frames in which limbs come from the rest pose to `pose`, the map of every joint [joints, 3, 4].
-
-    They start and end slowly.
-    """
+    """Return frames in which limbs come, slowly at both ends, from rest to `pose`, the map of every joint."""
     root = body.parents.index(-1)
     last = local_rotations(pose[None, :, :, :3], body.parents)
     time = np.arange(num_frames)[:, None, None] / num_frames
@@ -180,15 +176,10 @@ def _glide(motion: _Track, limbs: _Track | None, num_frames: int) -> _Track:
 
 
 def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
-    """Check that contacts can follow a body in every frame.
+    """Raise a MotionError where contacts can't follow a body; it names the first such frame and its speed.
 
-    Args:
-        poses: The body in motion.
-        limit: Largest step along the outward normal between two frames [m].
-        vertices: Body vertices that cloth can reach; None for all that are an obstacle.
-
-    Raises:
-        MotionError: A step is too long; the line names the first such frame, the speed, and what to do.
+    They follow `limit` [m] along the outward normal between two frames. `vertices` are those of the body that
+    cloth can reach; None for all that are an obstacle.
     """
     positions, faces = np.asarray(poses.positions), np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
     if vertices is not None:

@@ -38,9 +38,7 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager((folder / _FOLDER).absolute(), options=options)
 
     def save(self, state: TrainState) -> None:
-        """Start writing a checkpoint; the state may be donated as soon as this returns.
-
-        Source: orbax copies to the host before it returns, and renames the folder when it is whole.
+        """Start writing a checkpoint; the state may be donated as soon as this returns, as orbax copies it first.
 
         Raises:
             CheckpointError: This checkpoint, or the one before it, could not be written.
@@ -58,10 +56,7 @@ class Checkpoints:
             self._manager.wait_until_finished()
 
     def restore(self, example: TrainState) -> TrainState:
-        """Return the newest checkpoint that can be read, and move newer ones aside, which can't.
-
-        Args:
-            example: A state of the same run: its shapes and types.
+        """Return the newest checkpoint that can be read, in the form of `example`; newer ones are moved aside.
 
         Raises:
             CheckpointError: There is none, or none can be read.

@@ -15,13 +15,10 @@ from eslr_jax.networks.registry import read_system
 
 
 def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> TrainConfig:
-    """Read a training configuration; see `registry.read_system` for its `model`.
+    """Read a training configuration from a TOML file; see `registry.read_system` for its `model`.
 
-    A file with `base`, the path of another one from where it is, changes that one's values.
-
-    Args:
-        path: TOML file.
-        overrides: Dotted keys and their values, such as {"model.refinement_steps": 4}.
+    A file with `base`, the path of another one from where it is, changes that one's values. `overrides` are
+    dotted keys and their values, such as {"model.refinement_steps": 4}.
 
     Raises:
         ConfigError: The file is missing or not TOML, or a value is unknown or impossible.
