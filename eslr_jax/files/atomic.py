@@ -70,11 +70,7 @@ def move_files(source: Path, target: Path, *, without: Iterable[str] = ()) -> No
     """Move the files of a folder that are written and flushed into another on the same disk: all of them or none.
 
     Files that they replace are set aside until the last one is in its place, and come back if one can't be moved.
-
-    Args:
-        source: Folder of the new files.
-        target: Folder that they go to.
-        without: Names of files that `target` shall not have any more.
+    `without` names files that `target` shall not have any more.
 
     Raises:
         AssetError: A name is taken by a folder.

@@ -146,18 +146,14 @@ def predict_acceleration(network: Network, problem: FrameProblem, state: ClothSt
 
 
 def refine(network: Network, problem: FrameProblem, state: ClothState, *, detach: bool = False) -> Prediction:
-    """Correct the solver's own initial guess, step by step.
+    """Correct the solver's own initial guess, step by step, by a network that reads the potential's gradient.
 
     Before each step the potential's gradient, and the preconditioned step down it, are taken at the last
     positions. With gates the network adds to a preconditioned gradient method with momentum: a new network is
     plain preconditioned descent.
 
-    Args:
-        network: One that reads the potential's gradient.
-        problem: The frame's problem.
-        state: Cloth at t.
-        detach: Stop gradients between steps, and those of the weights that combine directions: each step is then
-            trained to do its best from where it begins.
+    With `detach` gradients stop between steps, and so do those of the weights that combine directions: each step
+    is then trained to do its best from where it begins.
     """
     garment, material, config = problem.garment, problem.material, network.config
     inputs = graph_inputs(problem, state, config.graph)

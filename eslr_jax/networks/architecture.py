@@ -52,11 +52,7 @@ class Architecture(System):
     is_combined: ClassVar[Any] = False  # a refinement step minimises over its directions
 
     def __post_init__(self) -> None:
-        """Reject impossible values.
-
-        Raises:
-            ValueError: Names the field.
-        """
+        """Raise a ValueError that names the field of an impossible value."""
         check_numbers(self, may_be_zero=_MAY_BE_ZERO)
 
     @property

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.problem import FrameProblem, free_vertices
 from eslr_jax.terms.term import Term
 
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/tried.md)
@@ -49,12 +49,6 @@ def sum_diagonals(
     x = components(position)
     diagonals = (term.diagonal(x, problem, data) for term, data in problem.parts if is_counted(term))
     return sum(diagonals, jnp.zeros_like(x[0]))
-
-
-def free_vertices(problem: FrameProblem) -> Bool[Array, " vertices"]:
-    """Return which vertices the solver moves: neither padding nor pinned."""
-    garment = problem.garment
-    return garment.vertex_mask if problem.pin_targets is None else garment.vertex_mask & ~garment.is_pinned
 
 
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:

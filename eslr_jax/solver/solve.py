@@ -24,9 +24,9 @@ from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
-from eslr_jax.solver.minres import LinearSolution, solve_symmetric
 from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
+from eslr_jax.solver.tangent import LinearSolution, solve_symmetric
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
@@ -230,13 +230,10 @@ def solve_hessian(
     force: Float[Array, "vertices 3"],
     matrix: tangent.Tangent | None = None,
 ) -> LinearSolution:
-    """Solve H v = force by MINRES, preconditioned by the blocks on the diagonal of H.
+    """Solve H v = force [N] by MINRES, preconditioned by the blocks on the diagonal of H.
 
-    Args:
-        problem: The frame's problem.
-        position: Where the Hessian is taken [m], shape [vertices, 3]; a minimum of the potential.
-        force: Right side [N], shape [vertices, 3].
-        matrix: The Hessian, where it is known.
+    The Hessian is that at positions [m], shape [vertices, 3], of a minimum of the potential; or `matrix`, if
+    known.
     """
     matrix = tangent.tangent(problem, position) if matrix is None else matrix
     inverse = tangent.inverse_diagonal(matrix, problem, position)

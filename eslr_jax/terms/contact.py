@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.lists import Motion, find_pairs, joint_meshes
+from eslr_jax.contact.lists import Meshes, Motion, find_pairs, joint_meshes
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.pairs import CHUNK, Met, closest, corners_of
-from eslr_jax.contact.ways import Moved, move_clear
+from eslr_jax.contact.ways import move_clear
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, components, dot3, segment_sum, sub3, vertex_normals
 from eslr_jax.terms.friction import Friction, slip_energies
@@ -24,6 +24,8 @@ from eslr_jax.terms.problem import (
     STIFFNESS_RANGE,
     THICKNESS_RANGE,
     FrameProblem,
+    MovingBody,
+    free_vertices,
 )
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term
@@ -85,6 +87,13 @@ class NearPairs(NamedTuple):
         """Return max(thickness - h, 0) [m], h the height of a pair's first primitive over its second."""
         depth = jnp.maximum(self.thickness - dot3(self.normal, offset), 0.0)
         return jnp.where(self.stiffness > 0, depth, 0.0)
+
+
+def _with_body(start: Array, end: Array, body: MovingBody | None) -> tuple[Array, Array]:
+    """Return the vertices of cloth and body at both ends of a frame [m]."""
+    if body is None:
+        return start, end
+    return jnp.concatenate([start, body.start]), jnp.concatenate([end, body.end])
 
 
 def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3]) -> Vector3:
@@ -183,29 +192,32 @@ class Contact(Term):
             jnp.zeros_like(position.T),
             (now + inwards).T,
             -inwards.T,
-            joint_meshes(garment, body.surface, has_layers=self.has_layers),
+            self._meshes(garment, body),
             garment.vertex_mask & ~garment.is_pinned,
             self._num_rows(len(position)),
         )
         return grown.position.T
 
+    def _meshes(self, garment: Garment, body: Obstacle | MovingBody | None) -> Meshes:
+        return joint_meshes(garment, None if body is None else body.surface, has_layers=self.has_layers)
+
     def _num_rows(self, num_vertices: int) -> int:
         return starting_rows(num_vertices) if self.rows is None else self.rows
 
+    def _near_rows(self, num_vertices: int) -> int:
+        return max(self._num_rows(num_vertices) // _NEAR_SHARE, _LEAST_NEAR)
+
     def prepare(self, problem: FrameProblem) -> Meetings:
         """Return the pairs that are near at t."""
-        garment, body, count = problem.garment, problem.body, len(problem.position)
-        start = end = problem.position
-        if body is not None:
-            start, end = jnp.concatenate([start, body.start]), jnp.concatenate([end, body.end])
+        count = len(problem.position)
+        start, end = _with_body(problem.position, problem.position, problem.body)
         x, y = components(start), components(end)
         is_cloth = jnp.arange(len(start)) < count
         half = 0.5 * _NEAR_CLOTH
         radius = jnp.where(is_cloth, half, _NEAR_BODY - half).astype(start.dtype)
         still = jax.tree.map(jnp.zeros_like, x)
-        meshes = joint_meshes(garment, None if body is None else body.surface, has_layers=self.has_layers)
         motion = jax.lax.stop_gradient(Motion(x, still, radius))
-        found = find_pairs(motion, meshes, self._near_rows(count))
+        found = find_pairs(motion, self._meshes(problem.garment, problem.body), self._near_rows(count))
         kinds = []
         for rows, is_edge in found.pairs.kinds:
             here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
@@ -279,40 +291,27 @@ class Contact(Term):
 
         return jax.lax.fori_loop(0, _SWEEPS, sweep, position)
 
-    def _near_rows(self, num_vertices: int) -> int:
-        return max(self._num_rows(num_vertices) // _NEAR_SHARE, _LEAST_NEAR)
-
     def correct(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Meetings
     ) -> tuple[Float[Array, "vertices 3"], Meetings]:
         """Return positions at t + 1 [m] that are reached without crossing, and what came of it."""
-        garment, body = problem.garment, problem.body
-        is_free = garment.vertex_mask
-        if problem.pin_targets is not None:
-            is_free = is_free & ~garment.is_pinned
-        nothing = jnp.zeros((3, 0), position.dtype)
-
-        def moved(position: Array, problem: FrameProblem) -> Moved:
-            start = problem.position.T
-            ways = (nothing, nothing) if body is None else (body.start.T, (body.end - body.start).T)
-            surface = None if body is None else body.surface
-            meshes = joint_meshes(garment, surface, has_layers=self.has_layers)
-            return move_clear(
-                start,
-                position.T - start,
-                *ways,
-                meshes,
-                is_free,
-                self._num_rows(len(position)),
-                self._near_rows(len(position)),
-            )
-
-        ended = moved(*jax.lax.stop_gradient((position, problem)))
-        pushed = ended.position.T - jax.lax.stop_gradient(position)
+        target, fixed = jax.lax.stop_gradient((position, problem))
+        start, body, nothing = fixed.position.T, fixed.body, jnp.zeros((3, 0), position.dtype)
+        ways = (nothing, nothing) if body is None else (body.start.T, (body.end - body.start).T)
+        ended = move_clear(
+            start,
+            target.T - start,
+            *ways,
+            self._meshes(fixed.garment, body),
+            free_vertices(fixed),
+            self._num_rows(len(position)),
+            self._near_rows(len(position)),
+        )
+        pushed = ended.position.T - target
         is_far = ended.met[0].count + ended.met[1].count > 0
         near = jax.lax.cond(
             is_far,
-            lambda: jax.lax.stop_gradient(self._with_met(data.near, ended.met, position, problem)),
+            lambda: jax.lax.stop_gradient(self._with_met(data.near, ended.met, target, fixed)),
             lambda: jax.lax.stop_gradient(data.near),
         )
         return position + pushed, data._replace(near=near, ends=Ends(ended.is_passed, ended.most, is_far))
@@ -325,10 +324,7 @@ class Contact(Term):
         problem: FrameProblem,
     ) -> NearPairs:
         """Return near pairs and those that cloth would meet on its way, as far as the table holds them."""
-        start, end = problem.position, position
-        if problem.body is not None:
-            start = jnp.concatenate([start, problem.body.start])
-            end = jnp.concatenate([end, problem.body.end])
+        start, end = _with_body(problem.position, position, problem.body)
         for (ids, share, count), is_edge in zip(met, (False, True), strict=True):
             here, there = corners_of(components(start), ids), corners_of(components(end), ids)
             parted = jax.tree.map(lambda a, b, share=share: (1.0 - share) * a + share * b, here, there)
