@@ -37,7 +37,6 @@ class Fabric:
 
 
 def _measured(density: float, stretch: float, bending: float, what: str, name: str) -> Fabric:
-    """Return a fabric of the ten that were measured."""
     return Fabric(density, stretch, bending, what, f"{_WANG}: {name}")
 
 

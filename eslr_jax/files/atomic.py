@@ -100,7 +100,6 @@ def move_files(source: Path, target: Path, *, without: Iterable[str] = ()) -> No
 
 
 def _flush(path: Path) -> None:
-    """Flush a file's bytes, or a folder's entries, to the disk."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:

@@ -98,7 +98,6 @@ def _split(around: set[int], distance: list[int], i: int) -> tuple[list[int], li
 
 
 def _link(graph: Graph, a: int, b: int) -> None:
-    """Add an edge."""
     graph[a].add(b)
     graph[b].add(a)
 

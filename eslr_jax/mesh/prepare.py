@@ -222,7 +222,6 @@ def _pin_mask(name: str, num_vertices: int, is_pinned: np.ndarray | None) -> Boo
 def _areas(
     positions: Float[Array, "vertices 3"], corners: Int[Array, "triangles 3"]
 ) -> Float[Array, " triangles"]:
-    """Return the areas of triangles [m^2]."""
     a, b, c = (positions[corners[:, k]] for k in range(3))
     return 0.5 * safe_norm(jnp.cross(b - a, c - a))
 

@@ -273,15 +273,12 @@ def validate_orientation(
 
 
 def _diagonal(positions: np.ndarray) -> float:
-    """Return the bounding box's diagonal [m]."""
     return float(np.linalg.norm(positions.max(axis=0).astype(float) - positions.min(axis=0)))
 
 
 def _ids(values: np.ndarray) -> str:
-    """Format indices as (a, b, c)."""
     return "(" + ", ".join(str(int(value)) for value in values) + ")"
 
 
 def _point(values: np.ndarray) -> str:
-    """Format a position."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"

@@ -55,7 +55,6 @@ def apply_refinement(
 
 
 def _call(network: Network, *args: Any, **options: Any) -> Any:
-    """Apply a network's module."""
     weights = {"params": network.params}
     if network.constants:
         weights["constants"] = network.constants
@@ -81,27 +80,20 @@ def measure_statistics(
 
     Source: HOOD's `utils/normalization.py`.
     """
-    measured: Statistics = {}
     if network.config.reads_gradient:
-        return measured
+        return {}
     nodes = jax.lax.stop_gradient(_call(network, graph, method="with_types"))
     edges, topology = cast(build.Rows, graph.edges), cast(build.Topology, graph.globals)
     masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
     levels = zip(build.COARSE_SETS, topology.get("coarse", ()), strict=False)
     masks |= {name: level.edge_mask for name, level in levels}
-    world = {name: rows for name, rows in edges.items() if name.startswith("world")}
-    mesh = {name: rows for name, rows in edges.items() if name not in world}
-    for name, group, num_static in (
-        ("garment", nodes, features.HOOD_NODE_STATIC),
-        ("mesh", mesh, features.HOOD_MESH_STATIC),
-        ("world", world, 0),
-    ):
-        if group:
-            rows = jnp.concatenate(list(group.values()))
-            mask = jnp.concatenate([masks.get(kind, topology.get("world_mask")) for kind in group])
-            measured[name] = normalizer.measure(rows[:, : rows.shape[1] - num_static], mask)
-    measured["output"] = normalizer.measure(acceleration, garment.vertex_mask)
-    return measured
+    groups = {"output": [(acceleration, garment.vertex_mask)]}
+    for name, rows in (nodes | edges).items():
+        kind = build.normalizer_of(name)
+        changing = rows[:, : rows.shape[1] - features.HOOD_STATIC[kind]]
+        groups.setdefault(kind, []).append((changing, masks.get(name, topology.get("world_mask"))))
+    joined = {kind: map(jnp.concatenate, zip(*parts, strict=True)) for kind, parts in groups.items()}
+    return {kind: normalizer.measure(*parts) for kind, parts in joined.items()}
 
 
 def merge_statistics(network: Network, measured: Statistics) -> Network:

@@ -136,7 +136,6 @@ def _expected_shapes(config: Architecture) -> dict[str, tuple[int, ...]]:
 
 
 def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(network.parts)
     return {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
 
@@ -146,14 +145,9 @@ def _new_statistics(config: Architecture) -> Statistics:
     if config.reads_gradient:
         return {}
     sizes = feature_sizes(config.graph)
-    embedded = features.NUM_TYPES + (NUM_LEVELS if config.graph.has_coarse_edges else 0)
-    columns = {
-        "garment": sizes["garment"] + embedded - features.HOOD_NODE_STATIC,
-        "mesh": sizes["mesh"] - features.HOOD_MESH_STATIC,
-        "world": sizes["world"],
-        "output": 3,
-    }
-    return {name: normalizer.init_normalizer(count) for name, count in columns.items()}
+    columns = {kind: sizes[kind] - static for kind, static in features.HOOD_STATIC.items()}
+    columns["garment"] += features.NUM_TYPES + (NUM_LEVELS if config.graph.has_coarse_edges else 0)
+    return {name: normalizer.init_normalizer(count) for name, count in (columns | {"output": 3}).items()}
 
 
 def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Statistics, Places]:

@@ -210,6 +210,13 @@ def feature_sizes(kind: GraphKind) -> dict[str, int]:
     }
 
 
+def normalizer_of(name: str) -> str:
+    """Return the name of the normaliser of a graph's kind of node or edge (HOOD)."""
+    if name in ("garment", "body"):
+        return "garment"
+    return "world" if name.startswith("world") else "mesh"
+
+
 def incoming_edges(
     neighbor_mask: Bool[Array, "vertices degree"], num_edges: int
 ) -> Int[Array, "vertices degree"]:

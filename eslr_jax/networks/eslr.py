@@ -22,14 +22,13 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
 from eslr_jax.networks.architecture import TwoBranches, make_decoder, stack, world_mask
-from eslr_jax.networks.build import GraphKind, Rows, feature_sizes
+from eslr_jax.networks.build import GraphKind, Rows, feature_sizes, normalizer_of
 from eslr_jax.networks.dense import kernel_spread
 from eslr_jax.networks.gsa import GsaBlock
 from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents, make_mlp
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.normalizer import normalize
 from eslr_jax.networks.operators import mesh_tables, sum_receivers
-from eslr_jax.types import Normalizer
 
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
@@ -70,24 +69,15 @@ class GraphModule(nn.Module):
         if self.config.reads_gradient:
             return graph.nodes, graph.edges
 
-        def scale(
-            rows: Float[Array, "_ features"], normalizer: Normalizer, num_static: int
-        ) -> Float[Array, "_ features"]:
-            changing = rows.shape[1] - num_static
-            scaled = normalize(normalizer, rows[:, :changing])
-            return jnp.concatenate([scaled, rows[:, changing:]], axis=1)
+        def scaled(name: str, rows: Float[Array, "_ features"]) -> Float[Array, "_ features"]:
+            kind = normalizer_of(name)
+            changing = rows.shape[1] - features.HOOD_STATIC[kind]
+            return jnp.concatenate(
+                [normalize(statistics[kind], rows[:, :changing]), rows[:, changing:]], axis=1
+            )
 
-        nodes = {
-            name: scale(rows, statistics["garment"], features.HOOD_NODE_STATIC)
-            for name, rows in self.with_types(graph).items()
-        }
-        edges = {
-            name: scale(rows, statistics["world"], 0)
-            if name.startswith("world")
-            else scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
-            for name, rows in cast(Rows, graph.edges).items()
-        }
-        return nodes, edges
+        nodes = {name: scaled(name, rows) for name, rows in self.with_types(graph).items()}
+        return nodes, {name: scaled(name, rows) for name, rows in cast(Rows, graph.edges).items()}
 
     def with_types(self, graph: jraph.GraphsTuple) -> Rows:
         """Return the node features with the embedding of the vertex type behind the velocity, as in HOOD."""

@@ -66,7 +66,6 @@ class GsaBlock(nn.Module):
         return x, None
 
     def _norm(self, name: str, x: Float[Array, "vertices latent"]) -> Float[Array, "vertices latent"]:
-        """Apply a LayerNorm with weights of its own."""
         scale = self.param(f"{name}_scale", nn.initializers.ones, (x.shape[1],))
         bias = self.param(f"{name}_bias", nn.initializers.zeros, (x.shape[1],))
         return layer_norm(x, scale.astype(x.dtype), bias.astype(x.dtype))

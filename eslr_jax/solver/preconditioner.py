@@ -91,7 +91,6 @@ def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 
 def _squared_lengths(
     points: Float[Array, "vertices 3"], neighbors: Int[Array, "vertices degree"]
 ) -> Float[Array, "vertices degree"]:
-    """Return the squared distances of vertices from their neighbours [m^2]."""
     return sum((part[neighbors] - part[:, None]) ** 2 for part in points.T)  # type: ignore[return-value]
 
 

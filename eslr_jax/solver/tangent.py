@@ -293,5 +293,4 @@ def solve_symmetric(
 
 
 def _inner(left: Float[Array, "*shape"], right: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Return the sum of left times right, entry by entry."""
     return product(left.ravel(), right.ravel())

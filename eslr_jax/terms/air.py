@@ -160,7 +160,6 @@ def _gusty(mean: Array, height: Array, rates: Array, phases: Array, points: Arra
 
 
 def _mean(corners: tuple[Vector3, ...]) -> Vector3:
-    """Return the means of the corners of every face, by components."""
     a, b, c = corners
     third = 1.0 / 3.0
     return (third * (a[0] + b[0] + c[0]), third * (a[1] + b[1] + c[1]), third * (a[2] + b[2] + c[2]))

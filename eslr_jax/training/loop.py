@@ -149,7 +149,6 @@ def train(
 def _first_state(
     config: TrainConfig, datasets: tuple[TrainingData, ...], initial: Network | None
 ) -> TrainState:
-    """Return the state before the first step, of several seeds stacked."""
     states = [init_train_state(one, datasets) for one in seed_configs(config)]
     if initial is not None:  # copies, since a step donates its state
         initial = initial.replace(config=config.model)

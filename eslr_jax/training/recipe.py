@@ -56,7 +56,6 @@ def describe_train_config(config: TrainConfig) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the values of a TOML file; raise a ConfigError where it is missing or not TOML."""
     try:
         return tomllib.loads(path.read_text())
     except (FileNotFoundError, IsADirectoryError) as error:

@@ -182,7 +182,6 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
 
 
 def _choose(is_new: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """Return one of two trees."""
     return jax.tree.map(lambda one, other: jnp.where(is_new, one, other), new, old)
 
 
