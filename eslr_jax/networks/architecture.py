@@ -196,7 +196,7 @@ class TwoBranches(Architecture):
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
     seed: int = 0  # of the random attention features
 
-    is_attention_normed: ClassVar[bool] = False  # see `gsa.GsaBlock`
+    is_attention_normed: ClassVar[bool] = False  # see `attention.GsaBlock`
 
     @property
     def garment_options(self) -> dict[str, Any]:

@@ -22,9 +22,9 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
 from eslr_jax.networks.architecture import TwoBranches, make_decoder, stack, world_mask
+from eslr_jax.networks.attention import GsaBlock
 from eslr_jax.networks.build import GraphKind, Rows, feature_sizes, normalizer_of
 from eslr_jax.networks.dense import kernel_spread
-from eslr_jax.networks.gsa import GsaBlock
 from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents, make_mlp
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.normalizer import normalize
