@@ -20,9 +20,7 @@ class InitialGuess(NamedTuple):
     """Where the solver and the networks begin a frame."""
 
     position: Float[Array, "vertices 3"]  # [m]
-    inertial_energy: Float[
-        Array, ""
-    ]  # [J] at the pushed-out inertial guess, from which the initial gap counts
+    inertial_energy: Float[Array, ""]  # [J], of the pushed-out inertial guess: the initial gap counts from it
 
 
 def initial_guess(problem: FrameProblem) -> InitialGuess:

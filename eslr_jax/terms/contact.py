@@ -104,21 +104,15 @@ def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3])
     )
 
 
-class Ends(NamedTuple):
-    """What came of a frame's ends."""
-
-    is_passed: Bool[Array, ""] | bool = False
-    most: Int[Array, ""] | int = 0  # rows that the fullest table would have needed
-    is_far: Bool[Array, ""] | bool = False  # one was pushed by `ways.FAR`
-
-
 class Meetings(NamedTuple):
-    """Pairs of a frame."""
+    """Pairs of a frame, and what came of its ends."""
 
     near: NearPairs
     most_near: Int[Array, ""]  # that the fuller table of them would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
-    ends: Ends = Ends()
+    is_passed: Bool[Array, ""] | bool = False
+    most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
+    is_far: Bool[Array, ""] | bool = False  # an end was pushed by `ways.FAR`
 
 
 @struct.dataclass
@@ -151,7 +145,7 @@ class Contact(Term):
     # tenth more iterations.
     stiffness: Float[Array, ""] | float = 2.0 * CONTACT_STIFFNESS
     thickness: Float[Array, ""] | float = (
-        1e-3  # [m] of every cloth of a pair: layers keep 2 mm, as off the body
+        1e-3  # [m] of every cloth of a pair: layers keep 2 mm, as off a body
     )
     rows: int | None = struct.field(pytree_node=False, default=None)  # of either table; None: to be planned
     has_layers: bool = struct.field(pytree_node=False, default=True)  # cloth does not pass through cloth
@@ -314,7 +308,8 @@ class Contact(Term):
             lambda: jax.lax.stop_gradient(self._with_met(data.near, ended.met, target, fixed)),
             lambda: jax.lax.stop_gradient(data.near),
         )
-        return position + pushed, data._replace(near=near, ends=Ends(ended.is_passed, ended.most, is_far))
+        found = data._replace(near=near, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
+        return position + pushed, found
 
     def _with_met(
         self,
@@ -359,21 +354,21 @@ class Contact(Term):
     def status(self, problem: FrameProblem, data: Meetings) -> Int[Array, ""]:
         """Return whether a table was too small."""
         count = len(problem.position)
-        is_full = (data.most_near > self._near_rows(count)) | (data.ends.most > self._num_rows(count))
+        is_full = (data.most_near > self._near_rows(count)) | (data.most > self._num_rows(count))
         return jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
 
     def is_passed(self, data: Meetings) -> Bool[Array, ""] | None:
         """Return whether something was let through."""
-        return jnp.asarray(data.ends.is_passed)
+        return jnp.asarray(data.is_passed)
 
     def is_far(self, data: Meetings) -> Bool[Array, ""] | bool:
         """Return whether an end was pushed so far that cloth around it has to follow."""
-        return data.ends.is_far
+        return data.is_far
 
     def demand(self, data: Meetings) -> Int[Array, ""]:
         """Return the rows that the fullest search asked for."""
         near = jnp.where(data.most_near > _LEAST_NEAR, _NEAR_SHARE * data.most_near, 0)
-        return jnp.maximum(near, data.ends.most)
+        return jnp.maximum(near, data.most)
 
     def enlarged(self, demand: int) -> Contact | None:
         """Return itself with tables for so many rows and half as many more; None where they have room."""

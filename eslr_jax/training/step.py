@@ -153,12 +153,10 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, network.params)
         trained = optax.apply_updates(network.params, updates)
-        graphs = jax.tree.map(
-            lambda leaf: leaf.reshape(size * config.frames, *leaf.shape[2:]), samples.statistics
-        )
         seen = network
-        for graph in range(size * config.frames if graphs else 0):
-            seen = merge_statistics(seen, jax.tree.map(lambda leaf: leaf[graph], graphs))  # noqa: B023
+        for one, frame in np.ndindex(size, config.frames if samples.statistics else 0):
+            measured = jax.tree.map(lambda leaf: leaf[one, frame], samples.statistics)  # noqa: B023
+            seen = merge_statistics(seen, measured)
         network = network.replace(
             params=_choose(is_learning, trained, network.params),
             statistics=_choose(is_good, seen.statistics, network.statistics),
@@ -166,17 +164,15 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         pool = jax.tree.map(lambda all_, some: all_.at[indices].set(some), pool, samples.slot)
         metrics = {name: jnp.mean(values) for name, values in samples.metrics.items()}
         metrics |= {"gradient_norm": norm, "skipped": (~is_good).astype(jnp.float32)}
-        return (
-            TrainState(
-                network=network,
-                optimizer=_choose(is_learning, optimizer, state.optimizer),
-                pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
-                key=jax.random.key_data(key),
-                step=state.step + 1,
-                skipped=jnp.where(is_good, 0, state.skipped + 1),
-            ),
-            metrics,
+        state = TrainState(
+            network=network,
+            optimizer=_choose(is_learning, optimizer, state.optimizer),
+            pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
+            key=jax.random.key_data(key),
+            step=state.step + 1,
+            skipped=jnp.where(is_good, 0, state.skipped + 1),
         )
+        return state, metrics
 
     return train_step
 
