@@ -221,13 +221,9 @@ def _shares(
     across = np.maximum(sides.neighbor, 0)
     # The place of the common edge in the neighbour, and of the two edges after it.
     place = np.argmax(sides.hinge[across] == sides.hinge[:, :, None], axis=2)
-    turned = [(place + step) % 3 for step in range(3)]
-    others = [sides.hinge[across, where] for where in turned]
-    hinges = np.full((num_faces, _SLOTS), -1)
-    hinges[:, :3] = sides.hinge
-    for edge in range(3):
-        for step in (1, 2):
-            hinges[:, 2 + 2 * edge + step] = np.where(is_hinge[:, edge], others[step][:, edge], -1)
+    after = np.stack([(place + 1) % 3, (place + 2) % 3], axis=2)
+    others = np.where(is_hinge[:, :, None], sides.hinge[across[:, :, None], after], -1)
+    hinges = np.concatenate([sides.hinge, others.reshape(num_faces, -1)], axis=1)
 
     height = np.where(is_hinge, sides.height[across, place], 0.0)
     part = sides.height / (sides.height + height)
@@ -254,8 +250,8 @@ def _shares(
     rows = np.arange(num_faces)[:, None]
     edges = np.arange(3)[None]
     shares[rows, edges, edges] += far[rows, edges, place]
-    for step in (1, 2):
-        shares[rows, edges, 2 + 2 * edges + step] += far[rows, edges, turned[step]]
+    for step in range(2):
+        shares[rows, edges, 3 + 2 * edges + step] += far[rows, edges, after[:, :, step]]
     return hinges, np.where(hinges[:, None] >= 0, shares, 0.0)
 
 
