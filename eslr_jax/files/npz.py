@@ -18,11 +18,7 @@ _KINDS = {"f": "floats", "iu": "integers", "biu": "flags", "biuf": "flags", "fiu
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compressed: bool = False) -> None:
-    """Write named arrays as an npz archive, atomically; compressed, it is smaller and takes much longer.
-
-    Raises:
-        AssetError: The file can't be written.
-    """
+    """Write named arrays as an npz archive, atomically, or raise an AssetError; compressing takes much longer."""
     save = np.savez_compressed if is_compressed else np.savez
     with atomic_write(path) as temporary, temporary.open("wb") as stream:
         save(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]

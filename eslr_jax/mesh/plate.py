@@ -41,10 +41,7 @@ class _Sides(NamedTuple):
 
 
 def rest_corners(garment: Garment) -> Float[np.ndarray, "faces 3 2"]:
-    """Return the corners of every rest face in its own plane [m], the last at the origin; float64.
-
-    Real faces only: a padded garment's come first.
-    """
+    """Return the corners of every real rest face in its own plane [m], the last at the origin; float64."""
     inverse = np.asarray(garment.inverse_rest_frames, np.float64)[_is_real(garment)]
     edges = np.linalg.inv(inverse)
     return np.stack([edges[:, :, 0], edges[:, :, 1], np.zeros_like(edges[:, :, 0])], axis=1)

@@ -62,10 +62,7 @@ class GraphModule(nn.Module):
         return self.process(self.encode(graph, statistics), places)
 
     def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics) -> tuple[Rows, Rows]:
-        """Return node and edge features as the encoders read them.
-
-        HOOD's go through their normalisers, with an embedding of the vertex type.
-        """
+        """Return node and edge features as the encoders read them: HOOD's with embedded types, and normalised."""
         if self.config.reads_gradient:
             return graph.nodes, graph.edges
 

@@ -85,10 +85,7 @@ class LsdmpLayer(nn.Module):
         return latents, None
 
     def smooth(self, latents: Latents, tables: LayerTables) -> Latents:
-        """Average over neighbours and their edges a few times, then update the vertices.
-
-        Source: paper, eqs. 3 and 4.
-        """
+        """Average over neighbours and their edges a few times, then update the vertices (paper, eqs. 3 and 4)."""
         garment, body = propagate(latents, tables, self.config.smoothing_steps)
         world = latents.world
         if world is not None and body is not None:

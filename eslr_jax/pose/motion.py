@@ -44,10 +44,7 @@ class Motion:
 
 
 def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: float = 0.0) -> Motion:
-    """Return a motion that holds the rest pose.
-
-    The angle is that by which both arms are lifted from the rest pose [degrees]; a negative one lowers them.
-    """
+    """Return a motion of the rest pose, with both arms lifted by an angle [degrees]; a negative lowers them."""
     rotations = np.zeros((num_frames, len(body.joint_names), 3))
     if arm_angle:
         rotations = abduct_arms(rotations, body.joint_names, arm_angle, front=chest_direction(body))
@@ -213,10 +210,7 @@ def chest_direction(body: Body) -> np.ndarray:
 
 @jax.jit
 def _skin_frames(rest, weights, indices, directions, transforms, rotations):
-    """Return posed vertices of every frame, with pose blend shapes, if there are any, added at rest.
-
-    Source: Loper et al. 2015, equations 8 and 9.
-    """
+    """Return posed vertices of every frame, with pose blend shapes if any (Loper et al. 2015, eqs. 8 and 9)."""
 
     def pose(frame):
         if directions is None:

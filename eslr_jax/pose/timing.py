@@ -57,11 +57,7 @@ def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
 
 
 def cut_start(motion: Motion, seconds: float) -> Motion:
-    """Return a motion from a time on [s].
-
-    Raises:
-        MotionError: Fewer than two frames are left.
-    """
+    """Return a motion from a time on [s]; a MotionError where fewer than two frames are left."""
     first = round(seconds * motion.fps) if math.isfinite(seconds) else -1
     length = (len(motion.rotations) - 1) / motion.fps
     if not 0 <= first <= len(motion.rotations) - 2:

@@ -33,10 +33,7 @@ class Stiffness:
 def hessian_diagonal(
     problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
-    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at positions [m].
-
-    Padded vertices get one, so that dividing by it is safe.
-    """
+    """Return the sum of the terms' stiffness per vertex [N/m] at positions [m]; one where padded."""
     return jnp.where(problem.garment.vertex_mask, sum_diagonals(problem, position), 1.0)
 
 

@@ -162,11 +162,7 @@ class Term:
 
 
 def find_term(name: str) -> type[Term]:
-    """Return the term of MODULE:CLASS; the module is imported (host).
-
-    Raises:
-        ConfigError: There is no such module, or it has no such term.
-    """
+    """Return the term of MODULE:CLASS; a ConfigError where there is no such module or term (host)."""
     module, _, kind = name.partition(":")
     found = getattr(import_own(module, f"term {name}"), kind, None) if module and kind else None
     if not (isinstance(found, type) and issubclass(found, Term)):

@@ -47,11 +47,7 @@ class Checkpoints:
             self._manager.save(int(state.step), args=ocp.args.StandardSave(_plain(state)))
 
     def wait(self) -> None:
-        """Wait for what is being written, and raise its error.
-
-        Raises:
-            CheckpointError: The checkpoint could not be written, as on a full disk.
-        """
+        """Wait for what is being written; a CheckpointError where it could not be, as on a full disk."""
         with _explained():
             self._manager.wait_until_finished()
 
@@ -128,11 +124,7 @@ def write_run_config(folder: Path, config: TrainConfig, earlier: Mapping[str, An
 
 
 def read_run_config(folder: Path) -> TrainConfig:
-    """Return the configuration of a run.
-
-    Raises:
-        CheckpointError: The folder holds no run, or one of a newer format.
-    """
+    """Return the configuration of a run; a CheckpointError where there is none, or one of a newer format."""
     path = folder / "config.json"
     try:
         record = json.loads(path.read_text())

@@ -41,11 +41,7 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
 
 
 def read_train_config(values: Mapping[str, Any]) -> TrainConfig:
-    """Return a training configuration from plain values.
-
-    Raises:
-        ConfigError: A value is unknown or impossible.
-    """
+    """Return a training configuration from plain values; a ConfigError where one is unknown or impossible."""
     return from_dict(TrainConfig, {**values, "model": read_system(values["model"])})
 
 

@@ -87,11 +87,7 @@ def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) ->
 
 
 def make_mesh(config: TrainConfig) -> Mesh | None:
-    """Return all devices as one axis that a batch is spread over; None for a single device.
-
-    Raises:
-        ConfigError: The batch cannot be spread evenly.
-    """
+    """Return all devices as one axis, None for a single one; a ConfigError where they can't share a batch."""
     devices = jax.devices()
     if len(devices) == 1 or (config.batch_size == 1 and jax.process_count() == 1):
         return None
