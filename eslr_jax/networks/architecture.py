@@ -104,11 +104,7 @@ class Architecture(System):
         return predict_acceleration(network, problem, state)
 
     def check(self, network: Network) -> None:
-        """Compare the shapes of weights with the architecture; nothing is computed, and tracers are accepted.
-
-        Raises:
-            CheckpointError: A weight is missing, unknown, or of another shape.
-        """
+        """Raise a CheckpointError where shapes of weights don't fit the architecture; nothing is computed."""
         expected, given = _expected_shapes(self), _shapes(network)
         for name in sorted(expected.keys() | given.keys()):
             if expected.get(name) != given.get(name):

@@ -69,11 +69,7 @@ class Topology(TypedDict, total=False):
 def build_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph of a frame, or of one refinement step; `kind` is static.
-
-    Raises:
-        ConfigError: The network is hierarchical and the garment has no coarse levels.
-    """
+    """Return the graph of a frame, or of one refinement step; `kind` is static. See `build_frame_graph`."""
     graph = build_frame_graph(garment, material, inputs, kind)
     if not isinstance(inputs, RefinementInputs) or not kind.reads_gradient:
         return graph
@@ -83,7 +79,11 @@ def build_graph(
 def build_frame_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static."""
+    """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static.
+
+    Raises:
+        ConfigError: The network is hierarchical and the garment has no coarse levels.
+    """
     levels: dict[str, Garment | CoarseEdges] = {"mesh": garment}
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,

@@ -132,11 +132,7 @@ class EncodeProcessDecode(GraphModule):
         places: Places,
         changing: jraph.GraphsTuple | None = None,
     ) -> Float[Array, "vertices outputs"]:
-        """Finish the encoders, run both stacks and decode.
-
-        Raises:
-            ConfigError: The garment has another number of geodesic coordinates than the network reads.
-        """
+        """Finish the encoders, run both stacks and decode; a ConfigError where the embedding has another size."""
         config, (hidden, tables) = self.config, encoded
         garment, mesh, world = hidden.garment, hidden.edges["mesh"], hidden.world
         along = () if world is None else (world.edges, world.reverse)

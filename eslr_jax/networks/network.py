@@ -99,12 +99,7 @@ class Network:
 
 
 def check_network(network: Any) -> None:
-    """Check the argument `params` of the public functions.
-
-    Raises:
-        ConfigError: It is neither a network nor None, or its description is no `System`.
-        CheckpointError: Its weights are for another architecture.
-    """
+    """Raise a ConfigError where `params` is no network of a `System`, a CheckpointError where it doesn't fit."""
     if network is None:
         return
     if not isinstance(network, Network):

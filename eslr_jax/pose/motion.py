@@ -170,10 +170,8 @@ def _search_tables(rest_positions: bytes, faces: bytes) -> BodySurface:
 def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
     """Return a body of another shape, at rest, such as one of a SMPL model.
 
-    Of the shape coefficients `betas` [standard deviations], shape [shapes], those left out are zero.
-
-    Raises:
-        ConfigError: The body has fewer shapes, or a coefficient is not finite.
+    Of the shape coefficients `betas` [standard deviations], shape [shapes], those left out are zero. A
+    ConfigError says that there are too many, or that one is not finite.
     """
     given, known = np.asarray(betas, np.float64).ravel(), body.shape_directions.shape[-1]
     if len(given) > known or not np.isfinite(given).all():

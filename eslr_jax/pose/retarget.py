@@ -51,13 +51,10 @@ def abduct_arms(
     *,
     front: Sequence[float] | NDArray = (0.0, 0.0, 1.0),
 ) -> NDArray:
-    """Return rotations with both arms lifted sideways, shape [frames, joints, 3] [rad].
+    """Return rotations with both arms lifted sideways, shape [frames, joints, 3] [rad], or raise a MotionError.
 
-    Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits
-    open for a garment. `front` is the direction that the resting chest faces.
-
-    Raises:
-        MotionError: If the rig has no such arms.
+    Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits open
+    for a garment. `front` is the direction that the resting chest faces.
     """
     parts = find_named_parts(joint_names)
     result = np.array(rotations, dtype=np.float64)
@@ -82,10 +79,8 @@ def resample(
 ) -> tuple[NDArray, NDArray]:
     """Return a motion at another frame rate: slerp for rotations, a cubic spline for the root.
 
-    The first frame is kept; the last output frame is the last that falls inside the input.
-
-    Raises:
-        MotionError: If the motion is empty or a frame rate is not positive.
+    The first frame is kept; the last output frame is the last that falls inside the input. A MotionError says
+    where the motion is empty or a frame rate is not positive.
     """
     if len(rotations) == 0 or len(rotations) != len(translations):
         raise MotionError(f"{len(rotations)} frames of rotations, {len(translations)} of translations")

@@ -71,13 +71,10 @@ def cut_start(motion: Motion, seconds: float) -> Motion:
 
 
 def loop_motion(motion: Motion, seconds: float) -> Motion:
-    """Return a motion that repeats until it is this long [s].
+    """Return a motion that repeats until it is this long [s]; a MotionError where it is too short to repeat.
 
     Each repetition starts where the last one ended, facing the same way, and the end passes smoothly into the
     beginning.
-
-    Raises:
-        MotionError: The length is not positive, or the motion is too short to repeat.
     """
     frames = len(motion.rotations)
     if not (math.isfinite(seconds) and seconds > 0) or frames < 4:

@@ -38,11 +38,7 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager((folder / _FOLDER).absolute(), options=options)
 
     def save(self, state: TrainState) -> None:
-        """Start writing a checkpoint; the state may be donated as soon as this returns, as orbax copies it first.
-
-        Raises:
-            CheckpointError: This checkpoint, or the one before it, could not be written.
-        """
+        """Start to write a checkpoint of a state, copied first; a CheckpointError where one can't be written."""
         with _explained():
             self._manager.save(int(state.step), args=ocp.args.StandardSave(_plain(state)))
 
@@ -52,11 +48,7 @@ class Checkpoints:
             self._manager.wait_until_finished()
 
     def restore(self, example: TrainState) -> TrainState:
-        """Return the newest checkpoint that can be read, in the form of `example`; newer ones are moved aside.
-
-        Raises:
-            CheckpointError: There is none, or none can be read.
-        """
+        """Return the newest checkpoint that can be read, like `example`; damaged ones are moved aside."""
         steps = sorted(self._manager.all_steps(), reverse=True)
         if not steps:
             raise CheckpointError("there is no checkpoint to resume from; start without --resume")
