@@ -58,7 +58,7 @@ def _call(network: Network, *args: Any, **options: Any) -> Any:
     weights = {"params": network.params}
     if network.constants:
         weights["constants"] = network.constants
-    return network.config.module.apply(weights, *args, **options)
+    return network.config.module_class(network.config).apply(weights, *args, **options)
 
 
 def scale_output(network: Network, output: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:

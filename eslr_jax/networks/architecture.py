@@ -68,19 +68,10 @@ class Architecture(System):
         return self.correction_scale is not None
 
     @property
-    def reads_state(self) -> bool:
-        """Whether strain, relative velocity and signed distance are among the inputs of an acceleration."""
-        return self.features == "state" and not self.reads_gradient
-
-    @property
     def graph(self) -> GraphKind:
         """What the network reads of a frame."""
-        return GraphKind(self.reads_gradient, self.reads_state, world_edge_radius=self.world_edge_radius)
-
-    @property
-    def module(self) -> nn.Module:
-        """The Flax module."""
-        return self.module_class(self)
+        reads_state = self.features == "state" and not self.reads_gradient
+        return GraphKind(self.reads_gradient, reads_state, world_edge_radius=self.world_edge_radius)
 
     def draw_constants(self) -> dict[str, Any]:
         """Return arrays that are not trained."""
@@ -91,7 +82,7 @@ class Architecture(System):
 
         @jax.jit
         def declare() -> Any:
-            return self.module.init(jax.random.key(0), *_example(self))["params"]
+            return self.module_class(self).init(jax.random.key(0), *_example(self))["params"]
 
         return Network(draw_weights(declare(), seed), self, _new_statistics(self), self.draw_constants())
 
@@ -216,7 +207,7 @@ def make_decoder(config: Architecture, num_branches: int = 1) -> MLP:
         5 if config.has_gates else 3,
         config.hidden_layers,
         norm=False,
-        output_gain=START_GAIN if config.reads_gradient or config.reads_state else 1.0,
+        output_gain=START_GAIN if config.reads_gradient or config.graph.reads_state else 1.0,
         precision=config.precision,
     )
 
