@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
+from eslr_jax.solver.guess import InitialGuess
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
 from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
@@ -44,12 +45,7 @@ _PASSES = 3  # of a frame that is solved and corrected, at most
 MOST_RESIDUAL = 5.0
 
 
-class Start(NamedTuple):
-    """Where the solver begins a frame."""
-
-    position: Float[Array, "vertices 3"]  # [m]
-    inertial_energy: Float[Array, ""]  # [J], see `InitialGuess`
-    previous: Point | None = None  # from which a network came to `position`; None for the solver's own guess
+Start = InitialGuess  # where the solver begins a frame, of whatever origin
 
 
 def lower_point(reached: Point, previous: Point) -> Point:
