@@ -28,11 +28,12 @@ published losses, for tables. Side by side, from x_t to x_{t+1}:
 
 from eslr_jax.terms.air import Air
 from eslr_jax.terms.bending import Bending
-from eslr_jax.terms.collision import Collision, Ground
+from eslr_jax.terms.collision import Collision
 from eslr_jax.terms.contact import Contact
 from eslr_jax.terms.damping import Damping
 from eslr_jax.terms.friction import Friction
 from eslr_jax.terms.gravity import Gravity
+from eslr_jax.terms.ground import Ground
 from eslr_jax.terms.inertia import Inertia
 from eslr_jax.terms.stretch import Stretch
 from eslr_jax.terms.term import Elements, Term
