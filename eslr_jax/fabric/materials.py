@@ -37,7 +37,6 @@ class Fabric:
 
 
 def _measured(density: float, stretch: float, bending: float, what: str, name: str) -> Fabric:
-    """Return a fabric of the ten that were measured."""
     return Fabric(density, stretch, bending, what, f"{_WANG}: {name}")
 
 
@@ -87,14 +86,11 @@ class Woven:
 
 
 def _woven(name: str, stretch: tuple[float, float, float, float], bending: tuple[float, float]) -> Woven:
-    """Return a fabric of the ten that were measured by threads.
+    """Return a fabric of the ten that were measured by threads, one of `FABRICS`.
 
-    Args:
-        name: Of one of `FABRICS`.
-        stretch: The four numbers of the data's first row, c11, c12, c22 and c33 [N/m]: the energy per area is
-            c11 G_uu^2 + 2 c12 G_uu G_vv + c22 G_vv^2 + c33 G_uv^2, with v along the warp. A negative coupling is
-            taken as zero, as by ARCSim.
-        bending: At small curvature, of edges along u and along v [J].
+    The stretch is the four numbers of the data's first row, c11, c12, c22 and c33 [N/m]: the energy per area is
+    c11 G_uu^2 + 2 c12 G_uu G_vv + c22 G_vv^2 + c33 G_uv^2, with v along the warp. A negative coupling is taken as
+    zero, as by ARCSim. The bending is that at small curvature, of edges along u and along v [J].
     """
     fabric, (weft, coupling, warp, shear) = FABRICS[name], stretch
     stiffness = (2.0 * warp, 2.0 * weft, 2.0 * max(coupling, 0.0), 0.5 * shear)

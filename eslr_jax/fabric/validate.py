@@ -27,9 +27,8 @@ TIMESTEP_RANGE = Range(1e-4, 1.0, "s")  # HOOD's first step takes a third of a s
 def validate_material(material: Material, garment: Garment | None = None) -> None:
     """Check that every value of a fabric is finite and physical, and that arrays fit the garment.
 
-    Args:
-        material: Scalars, or one value per face (stretch, thickness), hinge (bending) or vertex (density).
-        garment: The garment it is for, padded if it will be; None skips the check of sizes.
+    Values are scalars, or one per face (stretch, thickness), hinge (bending) or vertex (density) of the garment,
+    padded if it will be; None skips the check of sizes.
 
     Raises:
         ConfigError: Names the field, its value and what is accepted.
@@ -59,9 +58,5 @@ def validate_material(material: Material, garment: Garment | None = None) -> Non
 
 
 def validate_timestep(timestep: Any) -> None:
-    """Check the duration of a frame [s].
-
-    Raises:
-        ConfigError: It is not a finite number in its range.
-    """
+    """Raise a ConfigError where the duration of a frame [s] is not a finite number in its range."""
     check_range("timestep", timestep, TIMESTEP_RANGE)

@@ -18,10 +18,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it onto `path` when the block succeeds.
 
     The temporary path keeps the suffix of `path`, because many writers choose their format by it. If the block
-    raises, the temporary file is removed and `path` is as before.
-
-    Raises:
-        AssetError: The folder is missing, or the file can't be written.
+    raises, the temporary file is removed and `path` is as before. An AssetError says why it can't be written.
     """
     target = Path(path)
     # Hidden, and unique to this call, so that two processes may write the same target.
@@ -45,11 +42,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def ensure_output_dir(path: str | Path) -> Path:
-    """Create a folder with its parents if it is missing, and check that a file can be written in it.
-
-    Raises:
-        AssetError: The folder can't be created or written, or the path is a file.
-    """
+    """Create a folder with its parents where it is missing; an AssetError where no file can be written in it."""
     folder = Path(path).expanduser()
     if folder.exists() and not folder.is_dir():
         raise AssetError(f"output folder {folder} is a file; choose another name or remove the file")
@@ -69,15 +62,8 @@ def ensure_output_dir(path: str | Path) -> Path:
 def move_files(source: Path, target: Path, *, without: Iterable[str] = ()) -> None:
     """Move the files of a folder that are written and flushed into another on the same disk: all of them or none.
 
-    Files that they replace are set aside until the last one is in its place, and come back if one can't be moved.
-
-    Args:
-        source: Folder of the new files.
-        target: Folder that they go to.
-        without: Names of files that `target` shall not have any more.
-
-    Raises:
-        AssetError: A name is taken by a folder.
+    Files that they replace are set aside until the last one is in its place, and come back if one can't be moved,
+    as an AssetError says. `without` names files that `target` shall not have any more.
     """
     new = sorted(file.name for file in source.iterdir())
     aside = Path(tempfile.mkdtemp(prefix=".old-", dir=target))
@@ -104,7 +90,6 @@ def move_files(source: Path, target: Path, *, without: Iterable[str] = ()) -> No
 
 
 def _flush(path: Path) -> None:
-    """Flush a file's bytes, or a folder's entries, to the disk."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:

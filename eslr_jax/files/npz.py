@@ -18,11 +18,7 @@ _KINDS = {"f": "floats", "iu": "integers", "biu": "flags", "biuf": "flags", "fiu
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compressed: bool = False) -> None:
-    """Write named arrays as an npz archive, atomically; compressed, it is smaller and takes much longer.
-
-    Raises:
-        AssetError: The file can't be written.
-    """
+    """Write named arrays as an npz archive, atomically, or raise an AssetError; compressing takes much longer."""
     save = np.savez_compressed if is_compressed else np.savez
     with atomic_write(path) as temporary, temporary.open("wb") as stream:
         save(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
@@ -31,12 +27,9 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compr
 def read_arrays(
     path: str | Path, *, content: str, names: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Read arrays of an npz archive; nothing is unpickled, and headers are checked before memory is taken.
+    """Read arrays of an npz archive, all or those of `names`; `content` is what messages call it: "trajectory".
 
-    Args:
-        path: Path of the archive.
-        content: What the file should hold, for messages, e.g. "trajectory".
-        names: Names of the arrays to read where present; None reads all.
+    Nothing is unpickled, and headers are checked before memory is taken.
 
     Raises:
         AssetError: The file is missing, truncated, damaged, larger than `MAX_BYTES`, or no npz archive.
@@ -78,16 +71,11 @@ def check_layout(
     remedy: str,
     error: type[EslrError] = AssetError,
 ) -> None:
-    """Raise unless arrays have the types and shapes of a layout; arrays that are absent are not checked.
+    """Raise an `error` unless arrays have the types and shapes of a layout; absent ones are not checked.
 
-    Args:
-        arrays: Arrays by name.
-        layout: For every name the kinds of dtype accepted, the dimensions, and for arrays of indices the
-            dimension that they index, e.g. `{"faces": ("iu", "faces 3", "vertices")}`. A word is one length
-            throughout.
-        what: What messages call the file.
-        remedy: What the user should do about it.
-        error: Class of the error.
+    `layout` has for every name the kinds of dtype accepted, the dimensions, and for arrays of indices the
+    dimension that they index, e.g. `{"faces": ("iu", "faces 3", "vertices")}`. A word is one length throughout.
+    `what` is what messages call the file, and `remedy` what the user should do about it.
     """
     lengths: dict[str, int] = {}
     for name in (name for name in layout if name in arrays):

@@ -20,10 +20,10 @@ def parsing(
     form: str = "",
     remedy: str = "export it again",
 ) -> Iterator[Path]:
-    """Check that a file exists, and turn whatever its parser raises into one named error.
+    """Check that a file exists, and turn whatever its parser raises into one named error; yields its path.
 
     Args:
-        path: Path of the file, which is yielded.
+        path: Path of the file.
         content: What the file should hold, for messages, e.g. "motion".
         max_bytes: Size of the largest file accepted [bytes].
         form: Format for messages where the suffix does not tell it, e.g. " as a pickle".

@@ -28,12 +28,9 @@ Graph = list[set[int]]  # neighbours of every vertex
 
 
 def add_coarse_edges(garment: Garment) -> Garment:
-    """Return a garment with the coarse edges that a hierarchical network reads.
+    """Return a prepared garment, NumPy or JAX, with the coarse edges that a hierarchical network reads.
 
-    A padded garment gets padded coarse edges, of sizes that follow from its number of mesh edges.
-
-    Args:
-        garment: A prepared garment, which is not padded afterwards; NumPy or JAX leaves.
+    A padded garment gets padded coarse edges, of sizes that follow from its number of mesh edges; pad it first.
     """
     mask = np.asarray(garment.edge_mask)
     pairs = np.stack([np.asarray(garment.senders)[mask], np.asarray(garment.receivers)[mask]], axis=1)
@@ -101,7 +98,6 @@ def _split(around: set[int], distance: list[int], i: int) -> tuple[list[int], li
 
 
 def _link(graph: Graph, a: int, b: int) -> None:
-    """Add an edge."""
     graph[a].add(b)
     graph[b].add(a)
 

@@ -79,17 +79,10 @@ def common_bucket(buckets: Sequence[Bucket]) -> Bucket:
 
 
 def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
-    """Pad a garment's arrays to a bucket.
+    """Return a garment, NumPy or JAX, padded to a bucket, that of `choose_bucket` by default, with NumPy leaves.
 
-    Padded vertices rest at the garment's mean position, with zero area and the first vertex's skin. Padded
-    faces, hinges and edges point at the last vertex and have zero area. Incidence tables don't list them.
-
-    Args:
-        garment: Garment with NumPy or JAX leaves.
-        bucket: Sizes to reach; that of `choose_bucket` by default.
-
-    Returns:
-        The padded garment, with NumPy leaves of the same dtypes.
+    Padded vertices rest at the garment's mean position, with zero area and the first vertex's skin. Padded faces,
+    hinges and edges point at the last vertex and have zero area. Incidence tables don't list them.
 
     Raises:
         CapacityError: The bucket is too small, or has no spare vertex.

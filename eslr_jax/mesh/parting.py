@@ -244,7 +244,6 @@ class _Body(_Mesh):
 
 
 def _longer(one: Float[np.ndarray, "rows 3"], other: Float[np.ndarray, "rows 3"]) -> np.ndarray:
-    """Return the longer of two vectors, row by row."""
     is_longer = np.einsum("ij,ij->i", one, one) >= np.einsum("ij,ij->i", other, other)
     return np.where(is_longer[:, None], one, other)
 

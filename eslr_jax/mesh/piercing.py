@@ -14,10 +14,7 @@ _AT_ONCE = 8_000  # faces that are compared with others at a time; bounds memory
 def close_faces(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], apart: float = 0.0
 ) -> Int[np.ndarray, "2 pairs"]:
-    """Return the pairs of faces whose boxes, along the axes, are at most so far apart [m].
-
-    Faces that share a vertex don't count.
-    """
+    """Return the pairs of faces, without a common vertex, whose boxes along the axes are near, `apart` [m]."""
     if not len(faces):
         return np.zeros((2, 0), np.int64)
     corners = positions[faces]

@@ -41,10 +41,7 @@ class _Sides(NamedTuple):
 
 
 def rest_corners(garment: Garment) -> Float[np.ndarray, "faces 3 2"]:
-    """Return the corners of every rest face in its own plane [m], the last at the origin; float64.
-
-    Real faces only: a padded garment's come first.
-    """
+    """Return the corners of every real rest face in its own plane [m], the last at the origin; float64."""
     inverse = np.asarray(garment.inverse_rest_frames, np.float64)[_is_real(garment)]
     edges = np.linalg.inv(inverse)
     return np.stack([edges[:, :, 0], edges[:, :, 1], np.zeros_like(edges[:, :, 0])], axis=1)
@@ -58,15 +55,10 @@ def warp_directions(
 ) -> Float[np.ndarray, "faces 2"]:
     """Return the direction of the warp on every real face: a unit vector in the frame of `rest_corners`.
 
-    Patterns are cut and drawn with the warp along the second texture coordinate. Without texture coordinates,
-    or where a face has none, the warp runs along a direction laid onto the rest mesh: by default up, as in a
-    garment whose pieces hang along the grain. A face that lies across it takes the mean of the faces around
-    it, or if there is none its own first edge.
-
-    Args:
-        garment: Prepared garment.
-        corner_uvs: Texture coordinates of the corners of its faces.
-        direction: Where the warp runs without them, any length.
+    Patterns are cut and drawn with the warp along the second texture coordinate, here of the corners of the
+    garment's faces. Without texture coordinates, or where a face has none, the warp runs along a direction laid
+    onto the rest mesh: by default up, as in a garment whose pieces hang along the grain. A face that lies across
+    it takes the mean of the faces around it, or if there is none its own first edge.
 
     Raises:
         MeshError: The texture coordinates fit another mesh, or the direction is no direction.
@@ -226,13 +218,9 @@ def _shares(
     across = np.maximum(sides.neighbor, 0)
     # The place of the common edge in the neighbour, and of the two edges after it.
     place = np.argmax(sides.hinge[across] == sides.hinge[:, :, None], axis=2)
-    turned = [(place + step) % 3 for step in range(3)]
-    others = [sides.hinge[across, where] for where in turned]
-    hinges = np.full((num_faces, _SLOTS), -1)
-    hinges[:, :3] = sides.hinge
-    for edge in range(3):
-        for step in (1, 2):
-            hinges[:, 2 + 2 * edge + step] = np.where(is_hinge[:, edge], others[step][:, edge], -1)
+    after = np.stack([(place + 1) % 3, (place + 2) % 3], axis=2)
+    others = np.where(is_hinge[:, :, None], sides.hinge[across[:, :, None], after], -1)
+    hinges = np.concatenate([sides.hinge, others.reshape(num_faces, -1)], axis=1)
 
     height = np.where(is_hinge, sides.height[across, place], 0.0)
     part = sides.height / (sides.height + height)
@@ -259,8 +247,8 @@ def _shares(
     rows = np.arange(num_faces)[:, None]
     edges = np.arange(3)[None]
     shares[rows, edges, edges] += far[rows, edges, place]
-    for step in (1, 2):
-        shares[rows, edges, 2 + 2 * edges + step] += far[rows, edges, turned[step]]
+    for step in range(2):
+        shares[rows, edges, 3 + 2 * edges + step] += far[rows, edges, after[:, :, step]]
     return hinges, np.where(hinges[:, None] >= 0, shares, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""From a rest mesh to a `Garment`."""
+"""From a rest mesh to a `Garment`, and what depends on its rest shape, as differentiable functions of it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.errors import MeshError
 from eslr_jax.mesh import padding, topology
 from eslr_jax.mesh.coarse import add_coarse_edges
-from eslr_jax.mesh.embedding import EmbeddingMode, geodesic_embedding
+from eslr_jax.mesh.geodesic import EmbeddingMode, geodesic_embedding
 from eslr_jax.mesh.surface import compact_groups
 from eslr_jax.mesh.validate import validate_lengths, validate_mesh, validate_orientation
+from eslr_jax.numerics import safe_norm, scatter_corners
 from eslr_jax.types import Garment
 
 
@@ -47,7 +48,7 @@ def prepare_garment(
         panel_corners: Corners of each face in the plane of the panel that it was cut from [m], shape
             [faces, 3, 2], where that measures lengths, areas and angles instead.
         embedding_size: Number of coordinates of the geodesic embedding.
-        embedding_mode: Kind of geodesic embedding; see `embedding.geodesic_embedding`.
+        embedding_mode: Its kind; see `mesh.geodesic`.
         allow_components: Accept a mesh of several connected components.
         pad: Pad to the garment's bucket.
         name: Name of the garment in messages.
@@ -77,14 +78,13 @@ def prepare_garment(
     skin_indices = np.asarray(skin_indices)
     _check_rows(name, num_vertices, skin_weights, skin_indices)
 
-    corners = sewn[faces]
+    corners, apart = sewn[faces], np.arange(3 * len(faces)).reshape(-1, 3)
     if panel_corners is not None:
         if np.shape(panel_corners) != (len(faces), 3, 2):
             raise MeshError(f"{name}: panel corners {np.shape(panel_corners)} do not fit {len(faces)} faces")
         corners = np.pad(np.asarray(panel_corners, np.float64), ((0, 0), (0, 0), (0, 1)))
-    points, apart = corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-    if panel_corners is not None:
-        validate_lengths(points, apart, name=f"{name}, as cut")
+        validate_lengths(corners.reshape(-1, 3), apart, name=f"{name}, as cut")
+    points = corners.reshape(-1, 3)
     areas = topology.face_areas(points, apart)
     hinges, hinge_faces = topology.find_hinges(faces)
     sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2).ravel()
@@ -126,10 +126,8 @@ def prepare_garment(
 def pad_alike(garments: Sequence[Garment], bucket: padding.Bucket | None = None) -> list[Garment]:
     """Pad garments to one bucket, so that they share compiled functions and can be stacked.
 
-    Args:
-        garments: Unpadded garments; those with coarse edges get them anew, padded too. Their materials are left
-            out.
-        bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
+    The bucket is by default the smallest that holds all garments and a spare vertex. Their coarse edges are made
+    anew, padded too, and their materials left out.
     """
     if bucket is None:
         bucket = padding.common_bucket([padding.garment_bucket(garment) for garment in garments])
@@ -143,6 +141,35 @@ def to_device(garment: Garment) -> Garment:
     dtypes = {"f": np.float32, "i": np.int32, "u": np.int32, "b": np.bool_}
     # Converted by NumPy: JAX would compile a program for every shape.
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtypes[leaf.dtype.kind])), garment)
+
+
+def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices 3"]) -> Garment:
+    """Return a garment whose lengths, areas and angles are measured on other rest positions.
+
+    These are `garment.sewn_positions`, changed [m], shape [vertices, 3]; the place from which the garment is
+    skinned moves as much. `prepare_garment` computes the same on the host, in float64. This one is for gradients
+    with respect to the shape that a garment is cut to; topology, skinning and embedding stay. Warp and weft stay
+    where they are in every face. Bending in N m does not follow: a `Plate` holds the shape that it was prepared
+    for, and energies of the new garment refuse it with a ConfigError. Describe bending by `bending_stiffness`.
+    """
+    is_real = garment.rest_areas > 0
+    areas = jnp.where(is_real, _areas(rest_positions, garment.faces), 0.0)
+    left, right = garment.hinges[:, [0, 1, 2]], garment.hinges[:, [1, 0, 3]]
+    hinge_areas = _areas(rest_positions, left) + _areas(rest_positions, right)
+    hinge_edges = rest_positions[garment.hinges[:, 1]] - rest_positions[garment.hinges[:, 0]]
+    thirds = jnp.broadcast_to((areas / 3.0)[:, None], garment.faces.shape)
+    return garment.replace(
+        rest_positions=garment.rest_positions + (rest_positions - garment.sewn_positions),
+        sewn_positions=rest_positions,
+        rest_areas=areas,
+        inverse_rest_frames=jnp.where(
+            is_real[:, None, None], _inverse_rest_frames(rest_positions, garment), garment.inverse_rest_frames
+        ),
+        hinge_rest_areas=jnp.where(garment.hinge_rest_areas > 0, hinge_areas, 0.0),
+        hinge_rest_lengths=jnp.where(garment.hinge_rest_areas > 0, safe_norm(hinge_edges), 0.0),
+        vertex_areas=scatter_corners(thirds, garment.face_incidence),
+        is_recut=True,
+    )
 
 
 def _check_rows(name: str, num_vertices: int, skin_weights: np.ndarray, skin_indices: np.ndarray) -> None:
@@ -190,3 +217,28 @@ def _pin_mask(name: str, num_vertices: int, is_pinned: np.ndarray | None) -> Boo
             "give one boolean per vertex, or indices"
         )
     return given
+
+
+def _areas(
+    positions: Float[Array, "vertices 3"], corners: Int[Array, "triangles 3"]
+) -> Float[Array, " triangles"]:
+    a, b, c = (positions[corners[:, k]] for k in range(3))
+    return 0.5 * safe_norm(jnp.cross(b - a, c - a))
+
+
+def _inverse_rest_frames(
+    positions: Float[Array, "vertices 3"], garment: Garment
+) -> Float[Array, "faces 2 2"]:
+    """Return the inverse of every face's edges in its own plane [1/m], see `topology.inverse_rest_frames`."""
+    a, b, c = (positions[garment.faces[:, k]] for k in range(3))
+    first, second = a - c, b - c
+    is_real = garment.rest_areas > 0
+    length = jnp.where(is_real, safe_norm(first), 1.0)
+    along = jnp.sum(first * second, axis=-1) / length
+    height = jnp.where(is_real, safe_norm(jnp.cross(first, second)) / length, 1.0)
+    zero = jnp.zeros_like(length)
+    rows = [
+        jnp.stack([1.0 / length, -along / (length * height)], axis=-1),
+        jnp.stack([zero, 1.0 / height], axis=-1),
+    ]
+    return jnp.stack(rows, axis=-2)

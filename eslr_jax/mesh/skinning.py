@@ -25,10 +25,7 @@ def transfer_skin_weights(
     """Take each garment vertex's weights from the closest body point, then smooth them over the garment.
 
     Positions are in the body's rest pose [m]. Loose skirts need about 20 Laplacian smoothings: the two legs tear
-    them otherwise.
-
-    Returns:
-        The four largest weights of every vertex, which sum to one, and their joints.
+    them otherwise. The result is the four largest weights of every vertex, which sum to one, and their joints.
     """
     nearest, barycentric = closest_points(positions, body_positions, body_faces)
     corners = body_faces[nearest]

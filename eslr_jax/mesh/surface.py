@@ -69,9 +69,6 @@ def pad_surface(surface: BodySurface) -> BodySurface:
 
     Padded faces and edges point at the last vertex. What is padded is in groups of its own, which are far away
     (`pad_body`), so no search looks into them. The `vertex_ids` of padded vertices name no vertex of the body.
-
-    Args:
-        surface: Of `prepare_surface`.
     """
     have = len(surface.vertex_ids)
     num_vertices = round_up(have + 1, _STEPS)

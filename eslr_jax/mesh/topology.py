@@ -56,10 +56,7 @@ def unique_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "pairs 2"
 def directed_edges(
     edges: Int[np.ndarray, "pairs 2"],
 ) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edges"], Int[np.ndarray, " edges"]]:
-    """Return senders and receivers of both directions of every edge, and the index of each one's reverse.
-
-    The result is sorted by receiver, then by sender.
-    """
+    """Return senders, receivers and reverses of both directions of all edges, by receiver, then by sender."""
     senders, receivers = np.concatenate([edges, edges[:, ::-1]]).T
     order = np.lexsort((senders, receivers))
     position = np.empty(len(order), np.int64)

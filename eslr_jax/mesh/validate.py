@@ -59,12 +59,9 @@ def validate_mesh(
 def validate_lengths(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str
 ) -> None:
-    """Check other positions of a mesh that `validate_mesh` has accepted, on which lengths alone are measured.
+    """Raise a MeshError on NaN, an implausible scale or degenerate faces in other positions of a valid mesh.
 
     Vertices of several garments may coincide there: an outfit's garments are sewn one by one.
-
-    Raises:
-        MeshError: NaN, an implausible scale, or degenerate faces.
     """
     positions, faces = np.asarray(positions), np.asarray(faces)
     check_arrays(positions, faces, name)
@@ -210,13 +207,10 @@ def validate_body(
     *,
     name: str = "body",
 ) -> None:
-    """Check that a body is closed where cloth may touch it, and that its faces point outside.
+    """Raise a MeshError where a body is empty, not finite, open where cloth may touch it, or inside out.
 
     Contact keeps cloth on the side that normals point to. Cloth that slipped in through a hole would be held
     inside. Faces that are no obstacle may have open edges.
-
-    Raises:
-        MeshError: The body is empty, not finite, open where cloth may touch it, or inside out.
     """
     positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
     check_arrays(positions, faces, name)
@@ -239,11 +233,7 @@ def validate_body(
 def check_outward(
     positions: Float[np.ndarray, "body_vertices 3"], faces: Int[np.ndarray, "body_faces 3"], *, name: str
 ) -> None:
-    """Check that the faces of a body, which may have holes, point outside.
-
-    Raises:
-        MeshError: They enclose a negative volume.
-    """
+    """Raise a MeshError where the faces of a body, which may have holes, enclose a negative volume."""
     volume = np.sum(np.linalg.det(positions[faces] - positions.mean(axis=0))) / 6
     if volume < -_FLAT * np.ptp(positions, axis=0).max() ** 3:
         raise MeshError(f"{name}: its faces point inside; flip the normals")
@@ -252,13 +242,9 @@ def check_outward(
 def validate_orientation(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str = "mesh"
 ) -> None:
-    """Check that the faces of a garment, a valid mesh, point outside.
+    """Raise a MeshError where the faces of a garment, a valid mesh, point inside.
 
-    The garment's holes are closed with fans, and the sign of the enclosed volume decides. Meshes that are
-    mostly hole pass.
-
-    Raises:
-        MeshError: The faces point inside.
+    Its holes are closed with fans, and the sign of the enclosed volume decides. Meshes that are mostly hole pass.
     """
     positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
     centered = positions - positions.mean(axis=0)
@@ -277,15 +263,12 @@ def validate_orientation(
 
 
 def _diagonal(positions: np.ndarray) -> float:
-    """Return the bounding box's diagonal [m]."""
     return float(np.linalg.norm(positions.max(axis=0).astype(float) - positions.min(axis=0)))
 
 
 def _ids(values: np.ndarray) -> str:
-    """Format indices as (a, b, c)."""
     return "(" + ", ".join(str(int(value)) for value in values) + ")"
 
 
 def _point(values: np.ndarray) -> str:
-    """Format a position."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"

@@ -10,6 +10,6 @@ Symbols of the paper and where they stand:
 | f_e, f_v: perceptrons of message passing, eqs. 1 and 2 | `mesh_mlp`, `world_mlp`, `vertex_mlp` of `LsdmpLayer` |
 | p_i, f'_v: smoothed latents and their perceptron, eqs. 3 and 4 | `propagate`, `smooth_mlp` of `LsdmpLayer` |
 | E_G: geodesic embedding | `Garment.geodesic_embedding` |
-| Q, K, V and the attention of GSA | `query`, `key`, `value` of `gsa.GsaBlock`, `attention.linear_attention` |
+| Q, K, V and the attention of GSA | `query`, `key`, `value` of `GsaBlock`, `attention.linear_attention` |
 | A: accelerations | `apply.scale_output` of the decoder's output |
 """

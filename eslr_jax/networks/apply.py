@@ -34,7 +34,8 @@ def apply_model(
     network: Network, graph: jraph.GraphsTuple, garment: Garment
 ) -> Float[Array, "vertices outputs"]:
     """Return the network's raw output for a graph of `build_graph`, of the network's kind; see `scale_output`."""
-    return _call(network, graph, network.statistics, _places(garment))
+    places = Places(garment.geodesic_embedding, garment.vertex_mask)
+    return _call(network, graph, network.statistics, places)
 
 
 def encode_frame(network: Network, graph: jraph.GraphsTuple) -> Any:
@@ -49,19 +50,15 @@ def apply_refinement(
 
     `encoded` is the result of `encode_frame`, and `changing` a graph of `build_refinement_graph`.
     """
-    return _call(network, encoded, _places(garment), changing, method="process")
-
-
-def _places(garment: Garment) -> Places:
-    return Places(garment.geodesic_embedding, garment.vertex_mask)
+    places = Places(garment.geodesic_embedding, garment.vertex_mask)
+    return _call(network, encoded, places, changing, method="process")
 
 
 def _call(network: Network, *args: Any, **options: Any) -> Any:
-    """Apply a network's module."""
     weights = {"params": network.params}
     if network.constants:
         weights["constants"] = network.constants
-    return network.config.module.apply(weights, *args, **options)
+    return network.config.module_class(network.config).apply(weights, *args, **options)
 
 
 def scale_output(network: Network, output: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
@@ -83,27 +80,20 @@ def measure_statistics(
 
     Source: HOOD's `utils/normalization.py`.
     """
-    measured: Statistics = {}
     if network.config.reads_gradient:
-        return measured
+        return {}
     nodes = jax.lax.stop_gradient(_call(network, graph, method="with_types"))
     edges, topology = cast(build.Rows, graph.edges), cast(build.Topology, graph.globals)
     masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
     levels = zip(build.COARSE_SETS, topology.get("coarse", ()), strict=False)
     masks |= {name: level.edge_mask for name, level in levels}
-    world = {name: rows for name, rows in edges.items() if name.startswith("world")}
-    mesh = {name: rows for name, rows in edges.items() if name not in world}
-    for name, group, num_static in (
-        ("garment", nodes, features.HOOD_NODE_STATIC),
-        ("mesh", mesh, features.HOOD_MESH_STATIC),
-        ("world", world, 0),
-    ):
-        if group:
-            rows = jnp.concatenate(list(group.values()))
-            mask = jnp.concatenate([masks.get(kind, topology.get("world_mask")) for kind in group])
-            measured[name] = normalizer.measure(rows[:, : rows.shape[1] - num_static], mask)
-    measured["output"] = normalizer.measure(acceleration, garment.vertex_mask)
-    return measured
+    groups = {"output": [(acceleration, garment.vertex_mask)]}
+    for name, rows in (nodes | edges).items():
+        kind = build.normalizer_of(name)
+        changing = rows[:, : rows.shape[1] - features.HOOD_STATIC[kind]]
+        groups.setdefault(kind, []).append((changing, masks.get(name, topology.get("world_mask"))))
+    joined = {kind: map(jnp.concatenate, zip(*parts, strict=True)) for kind, parts in groups.items()}
+    return {kind: normalizer.measure(*parts) for kind, parts in joined.items()}
 
 
 def merge_statistics(network: Network, measured: Statistics) -> Network:
@@ -148,18 +138,14 @@ def predict_acceleration(network: Network, problem: FrameProblem, state: ClothSt
 
 
 def refine(network: Network, problem: FrameProblem, state: ClothState, *, detach: bool = False) -> Prediction:
-    """Correct the solver's own initial guess, step by step.
+    """Correct the solver's own initial guess, step by step, by a network that reads the potential's gradient.
 
     Before each step the potential's gradient, and the preconditioned step down it, are taken at the last
     positions. With gates the network adds to a preconditioned gradient method with momentum: a new network is
     plain preconditioned descent.
 
-    Args:
-        network: One that reads the potential's gradient.
-        problem: The frame's problem.
-        state: Cloth at t.
-        detach: Stop gradients between steps, and those of the weights that combine directions: each step is then
-            trained to do its best from where it begins.
+    With `detach` gradients stop between steps, and so do those of the weights that combine directions: each step
+    is then trained to do its best from where it begins.
     """
     garment, material, config = problem.garment, problem.material, network.config
     inputs = graph_inputs(problem, state, config.graph)

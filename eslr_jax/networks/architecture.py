@@ -52,11 +52,7 @@ class Architecture(System):
     is_combined: ClassVar[Any] = False  # a refinement step minimises over its directions
 
     def __post_init__(self) -> None:
-        """Reject impossible values.
-
-        Raises:
-            ValueError: Names the field.
-        """
+        """Raise a ValueError that names the field of an impossible value."""
         check_numbers(self, may_be_zero=_MAY_BE_ZERO)
 
     @property
@@ -72,19 +68,10 @@ class Architecture(System):
         return self.correction_scale is not None
 
     @property
-    def reads_state(self) -> bool:
-        """Whether strain, relative velocity and signed distance are among the inputs of an acceleration."""
-        return self.features == "state" and not self.reads_gradient
-
-    @property
     def graph(self) -> GraphKind:
         """What the network reads of a frame."""
-        return GraphKind(self.reads_gradient, self.reads_state, world_edge_radius=self.world_edge_radius)
-
-    @property
-    def module(self) -> nn.Module:
-        """The Flax module."""
-        return self.module_class(self)
+        reads_state = self.features == "state" and not self.reads_gradient
+        return GraphKind(self.reads_gradient, reads_state, world_edge_radius=self.world_edge_radius)
 
     def draw_constants(self) -> dict[str, Any]:
         """Return arrays that are not trained."""
@@ -95,7 +82,7 @@ class Architecture(System):
 
         @jax.jit
         def declare() -> Any:
-            return self.module.init(jax.random.key(0), *_example(self))["params"]
+            return self.module_class(self).init(jax.random.key(0), *_example(self))["params"]
 
         return Network(draw_weights(declare(), seed), self, _new_statistics(self), self.draw_constants())
 
@@ -108,11 +95,7 @@ class Architecture(System):
         return predict_acceleration(network, problem, state)
 
     def check(self, network: Network) -> None:
-        """Compare the shapes of weights with the architecture; nothing is computed, and tracers are accepted.
-
-        Raises:
-            CheckpointError: A weight is missing, unknown, or of another shape.
-        """
+        """Raise a CheckpointError where shapes of weights don't fit the architecture; nothing is computed."""
         expected, given = _expected_shapes(self), _shapes(network)
         for name in sorted(expected.keys() | given.keys()):
             if expected.get(name) != given.get(name):
@@ -140,7 +123,6 @@ def _expected_shapes(config: Architecture) -> dict[str, tuple[int, ...]]:
 
 
 def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(network.parts)
     return {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
 
@@ -150,14 +132,9 @@ def _new_statistics(config: Architecture) -> Statistics:
     if config.reads_gradient:
         return {}
     sizes = feature_sizes(config.graph)
-    embedded = features.NUM_TYPES + (NUM_LEVELS if config.graph.has_coarse_edges else 0)
-    columns = {
-        "garment": sizes["garment"] + embedded - features.HOOD_NODE_STATIC,
-        "mesh": sizes["mesh"] - features.HOOD_MESH_STATIC,
-        "world": sizes["world"],
-        "output": 3,
-    }
-    return {name: normalizer.init_normalizer(count) for name, count in columns.items()}
+    columns = {kind: sizes[kind] - static for kind, static in features.HOOD_STATIC.items()}
+    columns["garment"] += features.NUM_TYPES + (NUM_LEVELS if config.graph.has_coarse_edges else 0)
+    return {name: normalizer.init_normalizer(count) for name, count in (columns | {"output": 3}).items()}
 
 
 def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Statistics, Places]:
@@ -206,7 +183,7 @@ class TwoBranches(Architecture):
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
     seed: int = 0  # of the random attention features
 
-    is_attention_normed: ClassVar[bool] = False  # see `gsa.GsaBlock`
+    is_attention_normed: ClassVar[bool] = False  # see `attention.GsaBlock`
 
     @property
     def garment_options(self) -> dict[str, Any]:
@@ -230,7 +207,7 @@ def make_decoder(config: Architecture, num_branches: int = 1) -> MLP:
         5 if config.has_gates else 3,
         config.hidden_layers,
         norm=False,
-        output_gain=START_GAIN if config.reads_gradient or config.reads_state else 1.0,
+        output_gain=START_GAIN if config.reads_gradient or config.graph.reads_state else 1.0,
         precision=config.precision,
     )
 

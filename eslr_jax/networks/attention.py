@@ -1,20 +1,30 @@
-"""Linear attention by random features.
+"""Geodesic self-attention: linear attention by random features, among vertices that know their place.
 
 Attention weights w_ij in proportion to phi(q_i) . phi(k_j) need no matrix of all pairs:
 sum_j w_ij v_j = phi(q_i) (sum_j phi(k_j) v_j) / (phi(q_i) . sum_j phi(k_j)).
 
-Source: Choromanski et al., "Rethinking Attention with Performers" (2021).
+Symbols of the paper: V (`x`), E_G (`embedding`).
+
+Source: paper, section on geodesic self-attention; widths fitted to its parameter counts. Choromanski et al.,
+"Rethinking Attention with Performers" (2021).
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from eslr_jax.networks.dense import MLP, add_bias, kernel_spread, layer_norm, matmul
+
 SOFTMAX_EPSILON = 1e-6  # keeps the denominator positive; a larger one pulls the result to the mean of v
 RELU_EPSILON = 1e-3  # PyTorch Geometric's generalised kernel
+EMBEDDING_UNIT = 0.5  # [m]; a garment then spans a few units, like the latents beside it
+QUERY_GAIN = 0.3  # initial size of queries and keys: random features are accurate where they are small
 
 
 def orthogonal_projection(num_features: int, size: int, seed: int) -> np.ndarray:
@@ -91,3 +101,55 @@ def linear_attention(
     summary = key_features.T @ values
     total = jnp.sum(key_features, axis=0)
     return (query_features @ summary) / (query_features @ total)[:, None]
+
+
+class GsaBlock(nn.Module):
+    """x + W_o attention(W_q [x, E_G], W_k [x, E_G], W_v x), one head, linear in the vertices.
+
+    `is_attention_normed` puts a LayerNorm in front, which keeps q and k small for features of the softmax, and a
+    perceptron behind. The paper's parameter count has no room for them.
+    """
+
+    config: Any  # a `TwoBranches`
+
+    @nn.compact
+    def __call__(
+        self,
+        x: Float[Array, "vertices latent"],
+        inputs: tuple[
+            Float[Array, "vertices embedding"], Bool[Array, " vertices"], Float[Array, "features size"]
+        ],
+    ):
+        """Return the next latents, in the form that `nn.scan` asks for.
+
+        `inputs` are the geodesic embedding [m], the vertex mask and random directions.
+        """
+        config, (embedding, mask, projection) = self.config, inputs
+        size, width, precision = config.attention_size, config.latent_size, config.precision
+        here = self._norm("attention_norm", x) if config.is_attention_normed else x
+        located = jnp.concatenate([here, (embedding / EMBEDDING_UNIT).astype(x.dtype)], axis=1)
+
+        def project(name: str, rows, gain: float, outputs: int):
+            kernel = self.param(name, kernel_spread(gain**2), (rows.shape[1], outputs))
+            return matmul(rows, kernel.astype(rows.dtype), precision)
+
+        queries = project("query", located, QUERY_GAIN, size)
+        keys = project("key", located, QUERY_GAIN, size)
+        values = project("value", here, 1.0, size)
+        directions = projection.astype(x.dtype)
+        if config.is_attention_normed:
+            features = softmax_features(queries, keys, directions, mask)
+        else:
+            features = relu_features(queries, keys, directions)
+        mixed = project("output", linear_attention(*features, values, mask), 0.5, width)
+        bias = self.param("output_bias", nn.initializers.zeros, (width,))
+        x = x + add_bias(mixed, bias.astype(x.dtype))
+        if config.is_attention_normed:
+            perceptron = MLP(width, width, width, 1, norm=False, precision=precision, name="feedforward")
+            x = x + perceptron(self._norm("feedforward_norm", x))
+        return x, None
+
+    def _norm(self, name: str, x: Float[Array, "vertices latent"]) -> Float[Array, "vertices latent"]:
+        scale = self.param(f"{name}_scale", nn.initializers.ones, (x.shape[1],))
+        bias = self.param(f"{name}_bias", nn.initializers.zeros, (x.shape[1],))
+        return layer_norm(x, scale.astype(x.dtype), bias.astype(x.dtype))

@@ -69,11 +69,7 @@ class Topology(TypedDict, total=False):
 def build_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph of a frame, or of one refinement step; `kind` is static.
-
-    Raises:
-        ConfigError: The network is hierarchical and the garment has no coarse levels.
-    """
+    """Return the graph of a frame, or of one refinement step; `kind` is static. See `build_frame_graph`."""
     graph = build_frame_graph(garment, material, inputs, kind)
     if not isinstance(inputs, RefinementInputs) or not kind.reads_gradient:
         return graph
@@ -83,7 +79,11 @@ def build_graph(
 def build_frame_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static."""
+    """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static.
+
+    Raises:
+        ConfigError: The network is hierarchical and the garment has no coarse levels.
+    """
     levels: dict[str, Garment | CoarseEdges] = {"mesh": garment}
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,
@@ -130,7 +130,7 @@ def build_frame_graph(
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
             body = features.hood_body_features(contacts, inputs.timestep)
             world = features.hood_world_features(contacts, inputs, reads_state=kind.reads_state)
-        nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
+        nodes["body"], edges["world"] = (jnp.where(mask[:, None], rows, 0) for rows in (body, world))
         senders["world"] = jnp.arange(mask.shape[0])
         receivers["world"] = senders["world"] % count
         if kind.has_reverse_edges:
@@ -174,7 +174,7 @@ def build_refinement_graph(
     }
     if inputs.contacts is not None:
         world = features.refinement_world_features(inputs.guess, inputs.contacts)
-        edges["world"] = _mask_rows(world, frame_graph.globals["world_mask"])
+        edges["world"] = jnp.where(frame_graph.globals["world_mask"][:, None], world, 0)
         if "world_reverse" in frame_graph.edges:
             edges["world_reverse"] = edges["world"]  # distances have no direction
     return frame_graph._replace(nodes=nodes, edges=edges)
@@ -210,6 +210,13 @@ def feature_sizes(kind: GraphKind) -> dict[str, int]:
     }
 
 
+def normalizer_of(name: str) -> str:
+    """Return the name of the normaliser of a graph's kind of node or edge (HOOD)."""
+    if name in ("garment", "body"):
+        return "garment"
+    return "world" if name.startswith("world") else "mesh"
+
+
 def incoming_edges(
     neighbor_mask: Bool[Array, "vertices degree"], num_edges: int
 ) -> Int[Array, "vertices degree"]:
@@ -221,10 +228,3 @@ def incoming_edges(
     first = jnp.cumsum(degrees) - degrees
     edges = first[:, None] + jnp.arange(neighbor_mask.shape[1], dtype=jnp.int32)[None]
     return jnp.where(neighbor_mask, edges, num_edges)
-
-
-def _mask_rows(
-    rows: Float[Array, "rows features"], mask: Bool[Array, " rows"]
-) -> Float[Array, "rows features"]:
-    """Return `rows` with zeros where `mask` is False."""
-    return jnp.where(mask[:, None], rows, 0)

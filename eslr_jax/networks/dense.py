@@ -23,11 +23,9 @@ TALL = 512  # rows from which a weight gradient pays for a transposed copy
 def kernel_spread(gain: float | int):
     """Return an initialiser that fills a kernel with the standard deviation of its weights.
 
-    `architecture.draw_weights` multiplies the kernels by normal numbers from NumPy. These are the same on every
-    machine, and no random generator is compiled per kernel, which would take seconds.
-
-    Args:
-        gain: Variance of a weight times the number of the kernel's inputs.
+    `gain` is the variance of a weight times the number of the kernel's inputs. `architecture.draw_weights`
+    multiplies the kernels by normal numbers from NumPy. These are the same on every machine, and no random
+    generator is compiled per kernel, which would take seconds.
     """
 
     def fill(key, shape, dtype=jnp.float32):
@@ -120,27 +118,18 @@ _matmul_bfloat16.defvjp(_matmul_bfloat16_forward, _matmul_bfloat16_backward)
 class MLP(nn.Module):
     """A linear layer and ReLU per hidden layer, a linear layer, a LayerNorm.
 
-    The first layer can be applied to the pieces of a concatenated input one by one (`start`): its product
-    with the whole is the sum of its products with the pieces. So vertex latents are multiplied before the
-    edges gather them.
-
-    Attributes:
-        input_size: Number of columns of the concatenated input.
-        hidden_size: Number of columns of the hidden layers.
-        output_size: Number of columns of the output.
-        hidden_layers: Number of hidden layers; 0 is a single linear layer.
-        norm: End with a LayerNorm.
-        output_gain: Factor on the initial weights of the last layer.
-        precision: Type of the operands of matrix products.
+    The first layer can be applied to the pieces of a concatenated input one by one (`start`): its product with
+    the whole is the sum of its products with the pieces. So vertex latents are multiplied before the edges gather
+    them.
     """
 
-    input_size: int
+    input_size: int  # columns of the concatenated input
     hidden_size: int
     output_size: int
-    hidden_layers: int = 2
-    norm: bool = True
-    output_gain: float = 1.0
-    precision: Precision = "float32"
+    hidden_layers: int = 2  # 0 is a single linear layer
+    norm: bool = True  # end with a LayerNorm
+    output_gain: float = 1.0  # factor on the initial weights of the last layer
+    precision: Precision = "float32"  # of the operands of matrix products
 
     def setup(self) -> None:
         """Declare the weights."""
@@ -168,12 +157,9 @@ class MLP(nn.Module):
     def start(
         self, x: Float[Array, "rows piece"], offset: int, *, bias: bool = False
     ) -> Float[Array, "rows hidden"]:
-        """Return what a piece of the input adds to the first layer, before the ReLU.
+        """Return what a piece of the input, from column `offset` on, adds to the first layer, before the ReLU.
 
-        Args:
-            x: Piece of the input, shape [rows, piece].
-            offset: Column of the whole input at which the piece begins.
-            bias: Add the first layer's bias; True for exactly one piece.
+        `bias` adds the first layer's bias; it is True for exactly one piece.
         """
         kernel = self.kernels[0][offset : offset + x.shape[1]]
         hidden = matmul(x, kernel.astype(x.dtype), self.precision)

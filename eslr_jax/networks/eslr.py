@@ -22,14 +22,13 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
 from eslr_jax.networks.architecture import TwoBranches, make_decoder, stack, world_mask
-from eslr_jax.networks.build import GraphKind, Rows, feature_sizes
+from eslr_jax.networks.attention import GsaBlock
+from eslr_jax.networks.build import GraphKind, Rows, feature_sizes, normalizer_of
 from eslr_jax.networks.dense import kernel_spread
-from eslr_jax.networks.gsa import GsaBlock
 from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents, make_mlp
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.normalizer import normalize
 from eslr_jax.networks.operators import mesh_tables, sum_receivers
-from eslr_jax.types import Normalizer
 
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
@@ -63,43 +62,33 @@ class GraphModule(nn.Module):
         return self.process(self.encode(graph, statistics), places)
 
     def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics) -> tuple[Rows, Rows]:
-        """Return node and edge features as the encoders read them.
-
-        HOOD's go through their normalisers, with an embedding of the vertex type.
-        """
+        """Return node and edge features as the encoders read them: HOOD's with embedded types, and normalised."""
         if self.config.reads_gradient:
             return graph.nodes, graph.edges
 
-        def scale(
-            rows: Float[Array, "_ features"], normalizer: Normalizer, num_static: int
-        ) -> Float[Array, "_ features"]:
-            changing = rows.shape[1] - num_static
-            scaled = normalize(normalizer, rows[:, :changing])
-            return jnp.concatenate([scaled, rows[:, changing:]], axis=1)
+        def scaled(name: str, rows: Float[Array, "_ features"]) -> Float[Array, "_ features"]:
+            kind = normalizer_of(name)
+            changing = rows.shape[1] - features.HOOD_STATIC[kind]
+            return jnp.concatenate(
+                [normalize(statistics[kind], rows[:, :changing]), rows[:, changing:]], axis=1
+            )
 
-        nodes = {
-            name: scale(rows, statistics["garment"], features.HOOD_NODE_STATIC)
-            for name, rows in self.with_types(graph).items()
-        }
-        edges = {
-            name: scale(rows, statistics["world"], 0)
-            if name.startswith("world")
-            else scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
-            for name, rows in cast(Rows, graph.edges).items()
-        }
-        return nodes, edges
+        nodes = {name: scaled(name, rows) for name, rows in self.with_types(graph).items()}
+        return nodes, {name: scaled(name, rows) for name, rows in cast(Rows, graph.edges).items()}
 
     def with_types(self, graph: jraph.GraphsTuple) -> Rows:
         """Return the node features with the embedding of the vertex type behind the velocity, as in HOOD."""
+        return {
+            name: embedded(rows, VELOCITY_COLUMNS, self.type_embedding, graph.globals[f"{name}_type"])
+            for name, rows in cast(Rows, graph.nodes).items()
+        }
 
-        def insert(rows: Float[Array, "_ 11"], types: Int[Array, " _"]) -> Float[Array, "_ 20"]:
-            embedding = self.type_embedding.astype(rows.dtype)[types]
-            return jnp.concatenate(
-                [rows[:, :VELOCITY_COLUMNS], embedding, rows[:, VELOCITY_COLUMNS:]], axis=1
-            )
 
-        nodes = cast(Rows, graph.nodes)
-        return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in nodes.items()}
+def embedded(
+    rows: Float[Array, "_ features"], column: int, table: Float[Array, "types size"], types: Int[Array, " _"]
+) -> Float[Array, "_ more_features"]:
+    """Return rows with the embedding of their types, of a table, in front of a column."""
+    return jnp.concatenate([rows[:, :column], table.astype(rows.dtype)[types], rows[:, column:]], axis=1)
 
 
 class EncodeProcessDecode(GraphModule):
@@ -143,11 +132,7 @@ class EncodeProcessDecode(GraphModule):
         places: Places,
         changing: jraph.GraphsTuple | None = None,
     ) -> Float[Array, "vertices outputs"]:
-        """Finish the encoders, run both stacks and decode.
-
-        Raises:
-            ConfigError: The garment has another number of geodesic coordinates than the network reads.
-        """
+        """Finish the encoders, run both stacks and decode; a ConfigError where the embedding has another size."""
         config, (hidden, tables) = self.config, encoded
         garment, mesh, world = hidden.garment, hidden.edges["mesh"], hidden.world
         along = () if world is None else (world.edges, world.reverse)

@@ -42,9 +42,8 @@ STEP_SCALE = 0.1  # of the mean rest edge length
 TYPE_GARMENT, TYPE_BODY, TYPE_BODY_OMITTED, TYPE_PINNED = range(4)  # HOOD's vertex types
 NUM_TYPES = 9  # rows and columns of HOOD's embedding table
 HOOD_NODE_SIZE = 11  # + 9 embedding columns = 20
-HOOD_NODE_STATIC = 3  # last columns, which are not normalised
-HOOD_MESH_SIZE, HOOD_MESH_STATIC = 12, 3
-HOOD_WORLD_SIZE = 9
+HOOD_MESH_SIZE, HOOD_WORLD_SIZE = 12, 9
+HOOD_STATIC = {"garment": 3, "mesh": 3, "world": 0}  # last columns, which are not normalised
 STATE_MESH_SIZE, STATE_WORLD_SIZE = 5, 2  # columns of the kind "state" beside HOOD's
 
 

@@ -31,7 +31,7 @@ from eslr_jax.networks.apply import Places
 from eslr_jax.networks.architecture import Architecture, make_decoder, stack, world_mask
 from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, Rows, feature_sizes, join_features
 from eslr_jax.networks.dense import kernel_spread
-from eslr_jax.networks.eslr import VELOCITY_COLUMNS, GraphModule
+from eslr_jax.networks.eslr import VELOCITY_COLUMNS, GraphModule, embedded
 from eslr_jax.networks.lsdmp import Latents, LayerTables, WorldLatents, make_mlp, pass_messages
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.operators import coarse_tables, mesh_tables
@@ -120,13 +120,10 @@ class HierarchicalNetwork(GraphModule):
         """Return the node features with the embeddings of vertex type and level behind the velocity."""
         levels = vertex_levels(graph)
         column = VELOCITY_COLUMNS + features.NUM_TYPES
-
-        def insert(rows: Float[Array, "_ 20"], levels: Int[Array, " _"]) -> Float[Array, "_ 24"]:
-            embedding = self.level_embedding.astype(rows.dtype)[levels]
-            return jnp.concatenate([rows[:, :column], embedding, rows[:, column:]], axis=1)
-
-        rows = super().with_types(graph)
-        return {name: insert(one, levels if name == "garment" else 0 * levels) for name, one in rows.items()}
+        return {
+            name: embedded(rows, column, self.level_embedding, levels if name == "garment" else 0 * levels)
+            for name, rows in super().with_types(graph).items()
+        }
 
 
 def vertex_levels(graph: jraph.GraphsTuple) -> Int[Array, " vertices"]:

@@ -85,10 +85,7 @@ class LsdmpLayer(nn.Module):
         return latents, None
 
     def smooth(self, latents: Latents, tables: LayerTables) -> Latents:
-        """Average over neighbours and their edges a few times, then update the vertices.
-
-        Source: paper, eqs. 3 and 4.
-        """
+        """Average over neighbours and their edges a few times, then update the vertices (paper, eqs. 3 and 4)."""
         garment, body = propagate(latents, tables, self.config.smoothing_steps)
         world = latents.world
         if world is not None and body is not None:
@@ -148,11 +145,9 @@ def propagate(
 ) -> tuple[Float[Array, "vertices latent"], Float[Array, "world_edges latent"] | None]:
     """Smooth vertex latents: p_i = 1 / |N(i)| sum_(j in N(i)) (p_j + e_ij), `num_steps` times.
 
-    The mean of e_ij is the same in every step and computed once. A vertex without neighbours keeps its latent. A
-    body row has one neighbour, the garment vertex at the other end of its world edge.
-
-    Returns:
-        Smoothed latents of the garment, and of the body rows; None for these where they are constant.
+    Returns those of the garment, and those of the body rows, which are None where these are constant. The mean of
+    e_ij is the same in every step and computed once. A vertex without neighbours keeps its latent. A body row has
+    one neighbour, the garment vertex at the other end of its world edge.
 
     Source: paper, eq. 3.
     """

@@ -53,10 +53,7 @@ class System:
     form: Any = "positions"  # what it predicts, in words
 
     def new_network(self, seed: int, example: Example) -> Network:
-        """Return a network with new weights.
-
-        `example` returns a frame's problem and the state before it, from which shapes are read.
-        """
+        """Return a network with new weights; `example` returns a frame's problem and state, for their shapes."""
         return Network(self.init(jax.random.key(seed), *example()), self)
 
     def predict(
@@ -102,12 +99,7 @@ class Network:
 
 
 def check_network(network: Any) -> None:
-    """Check the argument `params` of the public functions.
-
-    Raises:
-        ConfigError: It is neither a network nor None, or its description is no `System`.
-        CheckpointError: Its weights are for another architecture.
-    """
+    """Raise a ConfigError where `params` is no network of a `System`, a CheckpointError where it doesn't fit."""
     if network is None:
         return
     if not isinstance(network, Network):
@@ -143,11 +135,7 @@ def network(name: str) -> Callable[[type[_System]], type[_System]]:
 
 
 def find_system(name: str) -> type[System] | None:
-    """Return the system of a name, or None; the module of MODULE:NAME is imported.
-
-    Raises:
-        ConfigError: There is no such module, or it can't be imported.
-    """
+    """Return the system of a name, or None; a ConfigError where the module of MODULE:NAME can't be imported."""
     module = name.partition(":")[0]
     if name not in _systems and module != name:
         import_own(module, f"model {name}")
@@ -155,11 +143,7 @@ def find_system(name: str) -> type[System] | None:
 
 
 def describe_system(system: Any) -> dict[str, Any]:
-    """Return a system as plain values, ready for JSON; `registry.read_system` reads them.
-
-    Raises:
-        ConfigError: Its class is not registered.
-    """
+    """Return a registered system as plain values, for `registry.read_system`; a ConfigError for others."""
     names = [name for name, known in _systems.items() if known is type(system)]
     if not names:
         raise ConfigError(f'{type(system).__name__} has no name; mark the class by @network("NAME")')

@@ -76,10 +76,7 @@ take_receivers.defvjp(
 
 @jax.custom_vjp
 def take_senders(x: Float[Array, "vertices features"], tables: MeshTables) -> Float[Array, "edges features"]:
-    """Return the row of every edge's sender.
-
-    The backward pass sums over the edges that leave a vertex. They are the reverse edges of those that enter.
-    """
+    """Return the row of every edge's sender; backward sums over the reverses of the edges that enter a vertex."""
     return _take(x, tables.senders)
 
 

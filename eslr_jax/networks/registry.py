@@ -71,11 +71,9 @@ MODELS: dict[str, Architecture] = {
 
 
 def read_system(values: Any) -> System:
-    """Return the system that plain values describe.
+    """Return the system that plain values describe: a name, or a table with a name as `base` and other values.
 
-    Args:
-        values: A name, or a table with a name as `base` and values that differ from it. The name is one of
-            `MODELS`, or that of a registered system; MODULE:NAME for one's own.
+    The name is one of `MODELS`, or that of a registered system; MODULE:NAME for one's own.
 
     Raises:
         ConfigError: There is no such name, or an option is unknown or impossible.

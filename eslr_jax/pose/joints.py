@@ -241,18 +241,13 @@ def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarra
 def map_joints(
     target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None, *, same_names: bool = False
 ) -> dict[str, str]:
-    """Return the joint of the source that each joint of a rig follows.
+    """Return the joint of the source, a motion's skeleton, that each joint of the target, a body's, follows.
 
     A joint follows a joint of the same part: the one of the same name where the part has the same names in both
     rigs, in whatever order; else they are matched from the hips outwards, in proportion if two chains differ in
     length. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
-    out, and move with their parent.
-
-    Args:
-        target: Joints of the body.
-        source: Joints of the motion's file.
-        changes: Joints of the body to joints of the source; "" keeps one still.
-        same_names: Leave out joints that would follow one of another name, but for the changes.
+    out, and move with their parent. `changes` lead from joints of the target to joints of the source; "" keeps
+    one still. With `same_names` joints that would follow one of another name are left out, but for the changes.
 
     Raises:
         MotionError: A changed joint is not there.

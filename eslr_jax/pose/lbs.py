@@ -98,25 +98,15 @@ def skin(
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
 
 
-def skin_frames(
-    positions: Float[Array, "vertices 3"],
-    weights: Float[Array, "vertices influences"],
-    indices: Int[Array, "vertices influences"],
-    transforms: Float[Array, "frames joints 3 4"],
-) -> Float[Array, "frames vertices 3"]:
-    """Return skinned points of every frame [m], shape [frames, vertices, 3].
-
-    One frame after the other: a vmap would hold frames x vertices x influences matrices at once. Arguments are
-    those of `skin`, the maps for every frame.
-    """
-    return jax.lax.map(lambda frame: skin(positions, weights, indices, frame), transforms)
-
-
 def skin_garment(
     garment: Garment, transforms: Float[Array, "frames joints 3 4"]
 ) -> Float[Array, "frames vertices 3"]:
-    """Return the garment carried by the joints [m], shape [frames, vertices, 3]; see `skin_frames`."""
-    return skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
+    """Return the garment carried by the joints [m], shape [frames, vertices, 3].
+
+    One frame after the other: a vmap would hold frames x vertices x influences matrices at once.
+    """
+    rest = garment.rest_positions, garment.skin_weights, garment.skin_indices
+    return jax.lax.map(lambda frame: skin(*rest, frame), transforms)
 
 
 def bend(

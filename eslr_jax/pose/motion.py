@@ -37,25 +37,14 @@ class Motion:
     start: float = 0.0  # time of its first frame in the file that it comes from [s]
 
     def __post_init__(self) -> None:
-        """Check the arrays.
-
-        Raises:
-            MotionError: No frames, mismatched shapes, NaN, or an impossible frame rate.
-        """
+        """Raise a MotionError unless there are frames of finite values and fitting shapes at a possible rate."""
         joints = len(self.joint_names)
         tracks = {"rotations": (self.rotations, (joints, 3)), "translations": (self.translations, (3,))}
         check_tracks(f"motion {self.name}", tracks, self.fps)
 
 
 def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: float = 0.0) -> Motion:
-    """Return a motion that holds the rest pose.
-
-    Args:
-        body: The rig.
-        num_frames: Number of frames.
-        fps: Frames per second.
-        arm_angle: Angle by which both arms are lifted from the rest pose [degrees]; negative lowers them.
-    """
+    """Return a motion of the rest pose, with both arms lifted by an angle [degrees]; a negative lowers them."""
     rotations = np.zeros((num_frames, len(body.joint_names), 3))
     if arm_angle:
         rotations = abduct_arms(rotations, body.joint_names, arm_angle, front=chest_direction(body))
@@ -126,10 +115,8 @@ def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> 
     and translations the root's positions [m].
     """
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    skin = body.rest_positions, body.skin_weights, body.skin_indices, transforms
-    if body.pose_directions is None:
-        return _skin_frames(*skin), transforms
-    return _skin_bent(*skin, body.pose_directions, jnp.asarray(rotations[:, 1:], jnp.float32)), transforms
+    skin = body.rest_positions, body.skin_weights, body.skin_indices, body.pose_directions
+    return _skin_frames(*skin, transforms, jnp.asarray(rotations[:, 1:], jnp.float32)), transforms
 
 
 def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
@@ -158,11 +145,7 @@ def lowest_point(poses: BodyMotion) -> float:
 
 
 def check_length(poses: BodyMotion) -> None:
-    """Check that a body in motion has frames to simulate.
-
-    Raises:
-        MotionError: It has fewer than two.
-    """
+    """Raise a MotionError where a body in motion has fewer than two frames."""
     if len(poses.joint_transforms) < 2:
         raise MotionError(
             f"a simulation needs two frames or more; this motion has {len(poses.joint_transforms)}"
@@ -185,14 +168,10 @@ def _search_tables(rest_positions: bytes, faces: bytes) -> BodySurface:
 
 
 def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
-    """Return a body of another shape, at rest.
+    """Return a body of another shape, at rest, such as one of a SMPL model.
 
-    Args:
-        body: A body with shapes, such as a SMPL model.
-        betas: Shape coefficients [standard deviations], shape [shapes]; those left out are zero.
-
-    Raises:
-        ConfigError: The body has fewer shapes, or a coefficient is not finite.
+    Of the shape coefficients `betas` [standard deviations], shape [shapes], those left out are zero. A
+    ConfigError says that there are too many, or that one is not finite.
     """
     given, known = np.asarray(betas, np.float64).ravel(), body.shape_directions.shape[-1]
     if len(given) > known or not np.isfinite(given).all():
@@ -227,17 +206,13 @@ def chest_direction(body: Body) -> np.ndarray:
     return axes[:, 2]
 
 
-_skin_frames = jax.jit(lbs.skin_frames)
-
-
 @jax.jit
-def _skin_bent(rest, weights, indices, transforms, directions, rotations):
-    """Return posed vertices of every frame, with pose blend shapes added at rest.
-
-    Source: Loper et al. 2015, equations 8 and 9.
-    """
+def _skin_frames(rest, weights, indices, directions, transforms, rotations):
+    """Return posed vertices of every frame, with pose blend shapes if any (Loper et al. 2015, eqs. 8 and 9)."""
 
     def pose(frame):
+        if directions is None:
+            return lbs.skin(rest, weights, indices, frame[1])
         turned = jax.vmap(lbs.rotation_matrix)(frame[0]) - jnp.eye(3)[None]
         return lbs.skin(rest + lbs.bend(directions, turned), weights, indices, frame[1])
 
@@ -254,10 +229,7 @@ def _frame_at(step: int, num_frames: int, first: int = 0) -> int:
 
 
 def there_and_back(step: int, num_frames: int, first: int = 0) -> tuple[int, int]:
-    """Return the two frames of a step, for a motion that is played forth and back without end.
-
-    Frames before `first` are played once.
-    """
+    """Return the two frames of a step of a motion that is played forth and back; those before `first` once."""
     return _frame_at(step, num_frames, first), _frame_at(step + 1, num_frames, first)
 
 

@@ -21,10 +21,7 @@ ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bund
 
 
 def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArray:
-    """Return local axis-angle rotations [rad], shape [frames, joints, 3].
-
-    `global_rotations` are matrices since the rest pose, shape [frames, joints, 3, 3].
-    """
+    """Return local axis-angle rotations [rad] of matrices since the rest pose, shape [frames, joints, 3, 3]."""
     local = np.array(global_rotations, dtype=np.float64)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -54,13 +51,10 @@ def abduct_arms(
     *,
     front: Sequence[float] | NDArray = (0.0, 0.0, 1.0),
 ) -> NDArray:
-    """Return rotations with both arms lifted sideways, shape [frames, joints, 3] [rad].
+    """Return rotations with both arms lifted sideways, shape [frames, joints, 3] [rad], or raise a MotionError.
 
-    Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits
-    open for a garment. `front` is the direction that the resting chest faces.
-
-    Raises:
-        MotionError: If the rig has no such arms.
+    Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits open
+    for a garment. `front` is the direction that the resting chest faces.
     """
     parts = find_named_parts(joint_names)
     result = np.array(rotations, dtype=np.float64)
@@ -85,10 +79,8 @@ def resample(
 ) -> tuple[NDArray, NDArray]:
     """Return a motion at another frame rate: slerp for rotations, a cubic spline for the root.
 
-    The first frame is kept; the last output frame is the last that falls inside the input.
-
-    Raises:
-        MotionError: If the motion is empty or a frame rate is not positive.
+    The first frame is kept; the last output frame is the last that falls inside the input. A MotionError says
+    where the motion is empty or a frame rate is not positive.
     """
     if len(rotations) == 0 or len(rotations) != len(translations):
         raise MotionError(f"{len(rotations)} frames of rotations, {len(translations)} of translations")
@@ -113,10 +105,7 @@ def interpolate(
 
 
 def blend_rotations(start: NDArray, end: NDArray, fraction: NDArray) -> NDArray:
-    """Return rotations between two, along the shorter way, shape [frames, joints, 3] [rad].
-
-    `fraction` is the share of the way from `start` to `end`, shape [frames].
-    """
+    """Return rotations at a share of the way between two, the shorter way [rad], shape [frames, joints, 3]."""
     first, last = (Rotation.from_rotvec(np.reshape(values, (-1, 3))) for values in (start, end))
     step = (first.inv() * last).as_rotvec() * np.repeat(fraction, start.shape[1])[:, None]
     return (first * Rotation.from_rotvec(step)).as_rotvec().reshape(start.shape)

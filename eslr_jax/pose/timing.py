@@ -57,11 +57,7 @@ def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
 
 
 def cut_start(motion: Motion, seconds: float) -> Motion:
-    """Return a motion from a time on [s].
-
-    Raises:
-        MotionError: Fewer than two frames are left.
-    """
+    """Return a motion from a time on [s]; a MotionError where fewer than two frames are left."""
     first = round(seconds * motion.fps) if math.isfinite(seconds) else -1
     length = (len(motion.rotations) - 1) / motion.fps
     if not 0 <= first <= len(motion.rotations) - 2:
@@ -75,13 +71,10 @@ def cut_start(motion: Motion, seconds: float) -> Motion:
 
 
 def loop_motion(motion: Motion, seconds: float) -> Motion:
-    """Return a motion that repeats until it is this long [s].
+    """Return a motion that repeats until it is this long [s]; a MotionError where it is too short to repeat.
 
     Each repetition starts where the last one ended, facing the same way, and the end passes smoothly into the
     beginning.
-
-    Raises:
-        MotionError: The length is not positive, or the motion is too short to repeat.
     """
     frames = len(motion.rotations)
     if not (math.isfinite(seconds) and seconds > 0) or frames < 4:
@@ -121,10 +114,9 @@ def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) 
 
     Args:
         poses: The body in motion.
-        num_frames: Number of frames to put before it; drop as many from the result. With fewer than 25 there is
-            no time for the limbs, and all hold the first pose.
-        body: Whose motion it is. Without it, and for a mesh in motion, which has no skeleton, all hold the first
-            pose.
+        num_frames: Number of frames to put before it; drop as many from the result.
+        body: Whose motion it is. Without it, for a mesh in motion, which has no skeleton, and with fewer than 25
+            frames, all hold the first pose.
 
     Raises:
         MotionError: The number is negative, or the motion has fewer than two frames.
@@ -146,10 +138,7 @@ def begins_at_rest(num_frames: int, body: Body) -> bool:
 
 
 def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:
-    """Return frames in which limbs come from the rest pose to `pose`, the map of every joint [joints, 3, 4].
-
-    They start and end slowly.
-    """
+    """Return frames in which limbs come, slowly at both ends, from rest to `pose`, the map of every joint."""
     root = body.parents.index(-1)
     last = local_rotations(pose[None, :, :, :3], body.parents)
     time = np.arange(num_frames)[:, None, None] / num_frames
@@ -180,15 +169,10 @@ def _glide(motion: _Track, limbs: _Track | None, num_frames: int) -> _Track:
 
 
 def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
-    """Check that contacts can follow a body in every frame.
+    """Raise a MotionError where contacts can't follow a body; it names the first such frame and its speed.
 
-    Args:
-        poses: The body in motion.
-        limit: Largest step along the outward normal between two frames [m].
-        vertices: Body vertices that cloth can reach; None for all that are an obstacle.
-
-    Raises:
-        MotionError: A step is too long; the line names the first such frame, the speed, and what to do.
+    They follow `limit` [m] along the outward normal between two frames. `vertices` are those of the body that
+    cloth can reach; None for all that are an obstacle.
     """
     positions, faces = np.asarray(poses.positions), np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
     if vertices is not None:

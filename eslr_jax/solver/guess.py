@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import scatter_corners
-from eslr_jax.solver.potential import potential
+from eslr_jax.solver.potential import Point, potential
 from eslr_jax.terms.problem import FrameProblem, pin
 
 _COLLAPSED = 1e-6  # of a face's rest area, below which its normal means nothing
@@ -20,9 +20,8 @@ class InitialGuess(NamedTuple):
     """Where the solver and the networks begin a frame."""
 
     position: Float[Array, "vertices 3"]  # [m]
-    inertial_energy: Float[
-        Array, ""
-    ]  # [J] at the pushed-out inertial guess, from which the initial gap counts
+    inertial_energy: Float[Array, ""]  # [J], of the pushed-out inertial guess: the initial gap counts from it
+    previous: Point | None = None  # from which a network came to `position`; None for the solver's own guess
 
 
 def initial_guess(problem: FrameProblem) -> InitialGuess:

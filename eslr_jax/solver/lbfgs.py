@@ -48,9 +48,7 @@ class Stop(NamedTuple):
 
 
 class _State(NamedTuple):
-    x: Float[Array, " n"]
-    value: Float[Array, ""]
-    gradient: Float[Array, " n"]
+    point: Point  # of flat positions, as all vectors here
     smoothed: Float[Array, " n"]  # P g, with the preconditioner P
     pairs: Float[Array, "rows n"]  # steps s_k, then P y_k; two rings whose newest row is `head`
     by_gradient: Float[Array, " rows"]  # products of the pairs' rows with the gradient
@@ -105,21 +103,18 @@ def minimize(
     memory: int = 8,
     previous: Point | None = None,
 ) -> Minimum:
-    """Minimise `function` from `start` by L-BFGS.
+    """Minimise `function`, an energy [J] of positions [m], shape [vertices, 3], from `start` [m] by L-BFGS.
 
     The first pass of the loop evaluates the start, and does not count as an iteration. So the energy, which is
     most of a frame's program, is compiled only once.
 
     Args:
-        function: Differentiable energy [J] of positions [m], shape [vertices, 3].
-        start: Where to begin [m].
+        function: Differentiable energy.
+        start: Where to begin.
         stiffness: Initial Hessian of the recursion, up to a scale.
         stop: When to end.
         memory: Number of pairs of steps and gradient changes kept; static.
         previous: A point from which something else came to `start`; the step between is the first pair.
-
-    Returns:
-        The lowest point that was reached, and the iterations it took.
 
     Source: Nocedal and Wright 2006, algorithm 7.4, with backtracking from the unit step.
     """
@@ -128,38 +123,39 @@ def minimize(
     def inverse(force: Float[Array, " n"]) -> Float[Array, " n"]:
         return _flat(balance(_vectors(force)))
 
-    def value_and_gradient(x: Float[Array, " n"]):
+    def at(x: Float[Array, " n"]) -> Point:
         split = tuple(jax.lax.split(x, (x.size // 3,) * 3))
         value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(split)
         # Written over x one by one: joined at once, XLA computes them in a loop that it can't vectorise.
         gradient = x
         for axis, part in enumerate(parts):
             gradient = jax.lax.dynamic_update_slice(gradient, part, (axis * part.size,))
-        return value, gradient
+        return Point(x, value, gradient)
 
     def is_at_rest(state: _State) -> Array:
         # Cloth that does not move gains less than the rounding of its energy, with either sign.
-        most = jnp.maximum(jnp.abs(stop.reference - state.value), _CAUTION * state.decrement)
-        return jnp.isfinite(state.value) & (most <= _rounding(state.value))
+        value = state.point.value
+        most = jnp.maximum(jnp.abs(stop.reference - value), _CAUTION * state.decrement)
+        return jnp.isfinite(value) & (most <= _rounding(value))
 
     def is_running(state: _State) -> Array:
-        is_above = product(state.gradient, state.gradient) > jnp.square(stop.force)
-        is_far = _CAUTION * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
-        is_far = is_far | (product(state.gradient, state.gradient) > jnp.square(stop.most_force))
+        _, value, gradient = state.point
+        is_above = product(gradient, gradient) > jnp.square(stop.force)
+        is_far = _CAUTION * state.decrement > stop.tolerance**2 * (stop.reference - value)
+        is_far = is_far | (product(gradient, gradient) > jnp.square(stop.most_force))
         is_far = is_far & ~((stop.tolerance > 0) & is_at_rest(state))
         is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
         return is_going | (state.iterations < 0)
 
     def iterate(state: _State) -> _State:
         is_first = state.iterations < 0
-        direction = jnp.where(is_first, _flat(start) - state.x, _direction(state))
-        slope = product(direction, state.gradient)
-        x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
+        direction = jnp.where(is_first, _flat(start) - state.point.position, _direction(state))
+        slope = product(direction, state.point.gradient)
+        point, is_lower = _backtrack(at, state, direction, slope)
         # If no step along the direction lowers the energy, the next iteration goes without the history. The
         # decrement of a direction that rounding has turned uphill tells nothing about the gap.
         kept = state._replace(is_kept=state.is_kept & is_lower)
-        moved = _advance(kept, Point(x, value, gradient), inverse)
-        return moved._replace(
+        return _advance(kept, point, inverse)._replace(
             decrement=jnp.where(is_first | (slope >= 0), jnp.inf, -0.5 * slope),
             iterations=state.iterations + 1,
             is_stuck=~is_lower & ~jnp.any(state.is_kept),
@@ -168,9 +164,7 @@ def minimize(
     before = unknown_point(start) if previous is None else previous
     x, gradient = _flat(before.position), _flat(before.gradient)
     initial = _State(
-        x=x,
-        value=jnp.full((), jnp.inf, x.dtype),
-        gradient=gradient,
+        point=Point(x, jnp.full((), jnp.inf, x.dtype), gradient),
         smoothed=gradient if previous is None else inverse(gradient),  # of zero it is zero
         pairs=jnp.zeros((2 * memory, x.size), x.dtype),
         by_gradient=jnp.zeros(2 * memory, x.dtype),
@@ -183,12 +177,12 @@ def minimize(
         is_stuck=jnp.zeros((), bool),
     )
     final = jax.lax.while_loop(is_running, iterate, initial)
-    gain = stop.reference - final.value
+    gain = stop.reference - final.point.value
     share = _CAUTION * final.decrement / jnp.where(gain > 0, gain, 1.0)
     gap_bound = jnp.where(gain > 0, jnp.sqrt(share), jnp.inf)
     gap_bound = jnp.where(is_at_rest(final), 0.0, gap_bound)
-    position, gradient = _vectors(final.x), _vectors(final.gradient)
-    return Minimum(position, final.value, gradient, final.iterations, gap_bound, jnp.int32(0))
+    position, gradient = _vectors(final.point.position), _vectors(final.point.gradient)
+    return Minimum(position, final.point.value, gradient, final.iterations, gap_bound, jnp.int32(0))
 
 
 def unknown_point(position: Float[Array, "vertices 3"]) -> Point:
@@ -216,8 +210,7 @@ def _vectors(flat: Float[Array, " n"]) -> Float[Array, "vertices 3"]:
 
 def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
     """Move to a point, and add the way there to the history, if it says anything about curvature."""
-    x, value, gradient = point
-    step, change = x - state.x, gradient - state.gradient
+    step, change = point.position - state.point.position, point.gradient - state.point.gradient
     # P g is summed up: as a difference of two P g, P y holds ten times the rounding.
     smoothed_change = inverse(change)
     smoothed = state.smoothed + smoothed_change
@@ -231,12 +224,10 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
     by_change = by_change.at[memory + head].set(products[memory:])  # Y'PY is symmetric
     weighted = products[memory + head]
     return state._replace(
-        x=x,
-        value=value,
-        gradient=gradient,
+        point=point,
         smoothed=smoothed,
         pairs=pairs,
-        by_gradient=product(pairs, gradient),
+        by_gradient=product(pairs, point.gradient),
         by_change=by_change,
         is_kept=state.is_kept.at[head].set(is_useful),
         head=head,
@@ -244,32 +235,29 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
     )
 
 
-def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, slope: Array):
-    """Halve the step until the energy falls enough; return the point's parts and whether it is another one.
+def _backtrack(
+    at: Callable[[Float[Array, " n"]], Point], state: _State, direction: Array, slope: Array
+) -> tuple[Point, Bool[Array, ""]]:
+    """Halve the step until the energy falls enough; return the point and whether it is another one.
 
     The first pass of `minimize` goes to the start, whatever its energy.
     """
     is_first = state.iterations < 0
-    slack = _rounding(state.value)
+    before = state.point
+    slack = _rounding(before.value)
 
     def is_wanting(carry):
-        size, trials, _, value, _ = carry
-        is_good = (value <= state.value + _ARMIJO * size * slope + slack) | is_first
+        size, trials, point = carry
+        is_good = (point.value <= before.value + _ARMIJO * size * slope + slack) | is_first
         return (trials == 0) | (~is_good & (trials <= _MAX_HALVINGS))
 
     def trial(carry):
-        size, trials, *_ = carry
+        size, trials, _ = carry
         size = jnp.where(trials == 0, 1.0, 0.5 * size)
-        x = state.x + size * direction
-        return (size, trials + 1, x, *value_and_gradient(x))
+        return size, trials + 1, at(before.position + size * direction)
 
     # The first trial is one of the loop's, so that the energy is compiled once.
-    untried = (jnp.zeros((), state.x.dtype), jnp.int32(0), state.x, state.value, state.gradient)
-    *_, x, value, gradient = jax.lax.while_loop(is_wanting, trial, untried)
-    is_kept = ((value <= state.value + slack) & (slope < 0)) | is_first
-    return (
-        jnp.where(is_kept, x, state.x),
-        jnp.where(is_kept, value, state.value),
-        jnp.where(is_kept, gradient, state.gradient),
-        is_kept,
-    )
+    untried = (jnp.zeros_like(before.value), jnp.int32(0), before)
+    *_, point = jax.lax.while_loop(is_wanting, trial, untried)
+    is_kept = ((point.value <= before.value + slack) & (slope < 0)) | is_first
+    return jax.tree.map(lambda new, old: jnp.where(is_kept, new, old), point, before), is_kept

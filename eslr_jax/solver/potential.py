@@ -25,12 +25,9 @@ class Point(NamedTuple):
 def potential_terms(
     position: Float[Array, "vertices 3"], problem: FrameProblem
 ) -> dict[str, Float[Array, ""]]:
-    """Return every energy of the frame [J], by the names of its terms.
+    """Return every energy of the frame [J], by the names of its terms, at positions at t + 1 [m].
 
-    Args:
-        position: Candidate positions at t + 1 [m], shape [vertices, 3]. Pinned vertices are put in place first,
-            so that the gradient vanishes there.
-        problem: The frame's problem.
+    Pinned vertices are put in place first, so that the gradient vanishes there.
     """
     x = components(pin(problem, position))  # once: gradients of all terms are then summed by components
     energies: dict[str, Array] = {}
@@ -51,12 +48,7 @@ def evaluate(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Poi
 
 
 def contact_load(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
-    """Return the normal force on every vertex [N] that loads the next frame's friction.
-
-    Args:
-        position: Positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem.
-    """
+    """Return the normal force on every vertex [N], at positions at t + 1 [m], for the next frame's friction."""
     loads = (term.load(position, problem, data) for term, data in problem.parts)
     return sum(loads, jnp.zeros(position.shape[0], position.dtype))
 

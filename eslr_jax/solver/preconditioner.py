@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.problem import FrameProblem, free_vertices
 from eslr_jax.terms.term import Term
 
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/tried.md)
@@ -33,10 +33,7 @@ class Stiffness:
 def hessian_diagonal(
     problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
-    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at positions [m].
-
-    Padded vertices get one, so that dividing by it is safe.
-    """
+    """Return the sum of the terms' stiffness per vertex [N/m] at positions [m]; one where padded."""
     return jnp.where(problem.garment.vertex_mask, sum_diagonals(problem, position), 1.0)
 
 
@@ -49,12 +46,6 @@ def sum_diagonals(
     x = components(position)
     diagonals = (term.diagonal(x, problem, data) for term, data in problem.parts if is_counted(term))
     return sum(diagonals, jnp.zeros_like(x[0]))
-
-
-def free_vertices(problem: FrameProblem) -> Bool[Array, " vertices"]:
-    """Return which vertices the solver moves: neither padding nor pinned."""
-    garment = problem.garment
-    return garment.vertex_mask if problem.pin_targets is None else garment.vertex_mask & ~garment.is_pinned
 
 
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
@@ -97,7 +88,6 @@ def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 
 def _squared_lengths(
     points: Float[Array, "vertices 3"], neighbors: Int[Array, "vertices degree"]
 ) -> Float[Array, "vertices degree"]:
-    """Return the squared distances of vertices from their neighbours [m^2]."""
     return sum((part[neighbors] - part[:, None]) ** 2 for part in points.T)  # type: ignore[return-value]
 
 

@@ -16,17 +16,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import zero_from_primal
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
+from eslr_jax.solver.guess import InitialGuess
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
-from eslr_jax.solver.minres import LinearSolution, solve_symmetric
 from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
+from eslr_jax.solver.tangent import LinearSolution, solve_symmetric
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
@@ -38,21 +39,13 @@ _REFUSED = 0.1
 # puts a T-shirt's gradient through five frames off by 0.7 %, 1e-3 by 3 % (experiments/inverse/accuracy.py).
 _LINEAR_STOP = {"float32": (1e-4, 500), "float64": (1e-9, 3000)}
 _LINEAR_STALL = 1e-2  # residual above which the derivative is refused
-
-
 _PASSES = 3  # of a frame that is solved and corrected, at most
-
 # [weights] Force with which a frame is not yet solved, whatever its tolerance, and which BDF2 does not carry on.
 # Within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15.
 MOST_RESIDUAL = 5.0
 
 
-class Start(NamedTuple):
-    """Where the solver begins a frame."""
-
-    position: Float[Array, "vertices 3"]  # [m]
-    inertial_energy: Float[Array, ""]  # [J], see `InitialGuess`
-    previous: Point | None = None  # from which a network came to `position`; None for the solver's own guess
+Start = InitialGuess  # where the solver begins a frame, of whatever origin
 
 
 def lower_point(reached: Point, previous: Point) -> Point:
@@ -94,7 +87,8 @@ def solve(
     Raises:
         ConfigError: The number of iterations is not an integer, as where somebody differentiates by it.
     """
-    return _solve(problem, *_checked(start, iterations, tolerance), memory, False).minimum
+    limits = {"iterations": iterations, "tolerance": tolerance, "memory": memory}
+    return solve_frame(problem, start, **limits, is_corrected=False).minimum
 
 
 def solve_frame(
@@ -104,22 +98,19 @@ def solve_frame(
     iterations: int | Int[Array, ""],
     tolerance: float | Float[Array, ""] = 0.0,
     memory: int = 8,
+    is_corrected: bool = True,
 ) -> Solved:
-    """Solve a frame, and let its terms correct where it ends (`Term.correct`).
+    """Solve a frame, and let its terms correct where it ends (`Term.correct`) if `is_corrected`, which is static.
 
     Where they move cloth far, the cloth around knows nothing of it. Then the frame is solved once more from
-    there, with their new data. Arguments and derivatives are those of `solve`; these take no notice of
-    corrections.
+    there, with their new data. The other arguments, errors and derivatives are those of `solve`; these take no
+    notice of corrections.
     """
-    return _solve(problem, *_checked(start, iterations, tolerance), memory, True)
-
-
-def _checked(start: Start, iterations: Any, tolerance: Any) -> tuple[Start, tuple[Array, Array]]:
     iterations = jnp.asarray(iterations)
     if not jnp.issubdtype(iterations.dtype, jnp.integer):
         raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
     limits = iterations, jnp.asarray(tolerance, start.inertial_energy.dtype)
-    return jax.lax.stop_gradient((start, limits))
+    return _solve(problem, *jax.lax.stop_gradient((start, limits)), memory, is_corrected)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -210,14 +201,8 @@ def _solve_jvp(memory: int, is_corrected: bool, primals: tuple, tangents: tuple)
         ended, data = jax.lax.stop_gradient(corrected(position, problem))
         minimum = minimum._replace(position=ended)
     solved = Solved(minimum, data)
-    still = jax.tree.map(_no_change, solved)
+    still = zero_from_primal(solved)
     return solved, still._replace(minimum=still.minimum._replace(position=move, value=value_change))
-
-
-def _no_change(value: Array) -> Any:
-    """Return the zero tangent of a value."""
-    is_real = jnp.issubdtype(value.dtype, jnp.inexact)
-    return jnp.zeros_like(value) if is_real else np.zeros(value.shape, jax.dtypes.float0)
 
 
 def _solve_hessian_linear(
@@ -228,7 +213,7 @@ def _solve_hessian_linear(
     matrix = tangent.tangent(problem, position)
 
     def solved(_, force: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        found = _solve_tangent(matrix, problem, position, force)
+        found = solve_hessian(problem, position, force, matrix)
         return jnp.where(found.residual < _LINEAR_STALL, found.displacement, jnp.nan)
 
     apply = partial(tangent.apply, matrix)
@@ -236,19 +221,17 @@ def _solve_hessian_linear(
 
 
 def solve_hessian(
-    problem: FrameProblem, position: Float[Array, "vertices 3"], force: Float[Array, "vertices 3"]
+    problem: FrameProblem,
+    position: Float[Array, "vertices 3"],
+    force: Float[Array, "vertices 3"],
+    matrix: tangent.Tangent | None = None,
 ) -> LinearSolution:
-    """Solve H v = force by MINRES, preconditioned by the blocks on the diagonal of H.
+    """Solve H v = force [N] by MINRES, preconditioned by the blocks on the diagonal of H.
 
-    Args:
-        problem: The frame's problem.
-        position: Where the Hessian is taken [m], shape [vertices, 3]; a minimum of the potential.
-        force: Right side [N], shape [vertices, 3].
+    The Hessian is that at positions [m], shape [vertices, 3], of a minimum of the potential; or `matrix`, if
+    known.
     """
-    return _solve_tangent(tangent.tangent(problem, position), problem, position, force)
-
-
-def _solve_tangent(matrix: tangent.Tangent, problem: FrameProblem, position: Array, force: Array):
+    matrix = tangent.tangent(problem, position) if matrix is None else matrix
     inverse = tangent.inverse_diagonal(matrix, problem, position)
     tolerance, iterations = _LINEAR_STOP[str(force.dtype)]
     found = solve_symmetric(

@@ -23,17 +23,13 @@ def combine_directions(
 ) -> Float[Array, "vertices 3"]:
     """Return the displacement along `directions` that lowers `function` most [m], shape [vertices, 3].
 
-    The energy is taken as quadratic in the span; its curvature comes from one more gradient at the end of each
-    direction. The result, the first direction alone, and staying are then compared by their energy, so that a
-    step never climbs.
+    The energy [J], a function of positions [m], is taken as quadratic in the span; its curvature comes from one
+    more gradient at the end of each direction. The result, the first direction alone, and staying are then
+    compared by their energy, so that a step never climbs. A direction that is zero everywhere is left out.
 
-    Args:
-        function: Differentiable energy [J] of positions [m], shape [vertices, 3].
-        point: Where the directions begin.
-        directions: Displacements [m], shape [directions, vertices, 3]; one that is zero everywhere is left out.
-        fixed_weights: Differentiate as if the weights were constants. That is right for the energy of the
-            result, which does not depend on them to first order, and for nothing else; it is what training on
-            that energy takes, since it saves the second derivatives.
+    With `fixed_weights` the derivative is as if the weights were constants. That is right for the energy of the
+    result, which does not depend on them to first order, and for nothing else; it is what training on that energy
+    takes, since it saves the second derivatives.
 
     Source: sequential subspace optimisation, Narkiss and Zibulevsky 2005.
     """

@@ -3,11 +3,12 @@
 Faces, hinges and vertices give small blocks, the automatic derivatives of their energies; a vertex's row holds
 one block for each vertex that it shares a face or a hinge with. At 1k vertices a product takes a quarter of the
 time of one gradient, and a tenth of a product by automatic differentiation. The blocks on the diagonal
-precondition a solver.
+precondition a solver of linear systems with a symmetric matrix, which need not be positive definite.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,9 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.numerics import Vector3, components, segment_sum
-from eslr_jax.solver.preconditioner import free_vertices, hessian_diagonal, sum_diagonals
-from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.numerics import Vector3, components, product, segment_sum
+from eslr_jax.solver.preconditioner import hessian_diagonal, sum_diagonals
+from eslr_jax.terms.problem import FrameProblem, free_vertices, pin
 from eslr_jax.terms.term import mesh_corners
 from eslr_jax.types import Garment
 
@@ -72,26 +73,21 @@ def _element_blocks(on: str, x: Vector3, problem: FrameProblem) -> Float[Array, 
         )
         return sum(energies, jnp.zeros((), x[0].dtype))
 
-    _, product = jax.linearize(jax.grad(energy), corners)
+    _, curved = jax.linearize(jax.grad(energy), corners)
     leaves, tree = jax.tree.flatten(corners)
 
     def column(unit: Float[Array, " size"]) -> Float[Array, "size items"]:
         move = [jnp.broadcast_to(one, leaf.shape) for one, leaf in zip(unit, leaves, strict=True)]
-        return jnp.stack(jax.tree.leaves(product(jax.tree.unflatten(tree, move))))
+        return jnp.stack(jax.tree.leaves(curved(jax.tree.unflatten(tree, move))))
 
     return jax.vmap(column)(jnp.eye(len(leaves), dtype=leaves[0].dtype))
-
-
-def _couples(corners: int) -> list[tuple[int, int]]:
-    """Return the ordered pairs of an item's corners."""
-    return [(row, column) for row in range(corners) for column in range(corners)]
 
 
 def _as_rows(blocks: Float[Array, "size size items"]) -> Float[Array, "rows 9"]:
     """Return the 3x3 blocks of every couple of corners, couple by couple."""
     parts = [
         blocks[3 * a : 3 * a + 3, 3 * b : 3 * b + 3].reshape(9, -1).T
-        for a, b in _couples(blocks.shape[0] // 3)
+        for a, b in itertools.product(range(blocks.shape[0] // 3), repeat=2)
     ]
     return jnp.concatenate(parts)
 
@@ -118,7 +114,7 @@ def _pattern(garment: Garment) -> tuple[Int[Array, "slots vertices"], Int[Array,
 
     slots = []
     for items in (garment.faces, garment.hinges) if num_hinges else (garment.faces,):
-        for row, column in _couples(items.shape[1]):
+        for row, column in itertools.product(range(items.shape[1]), repeat=2):
             vertex = items[:, row]
             if row == column:
                 slot = jnp.zeros_like(vertex)
@@ -141,7 +137,7 @@ def apply(matrix: Tangent, move: Float[Array, "3 vertices"]) -> Float[Array, "3 
     free = jnp.where(matrix.is_free, move, 0.0)
     # Gathered at once, and the sum written out: a loop over the slots takes four times as long on a CPU.
     others = jax.lax.optimization_barrier(free.T[matrix.columns])
-    couples = [(slot, column) for slot in range(len(matrix.columns)) for column in range(3)]
+    couples = list(itertools.product(range(len(matrix.columns)), range(3)))
     rows = [
         sum(matrix.blocks[slot, row, column] * others[slot, :, column] for slot, column in couples)
         for row in range(3)
@@ -174,3 +170,127 @@ def inverse_diagonal(
     inverse = jnp.stack(cofactors)[order] / jnp.where(is_positive, determinant, 1.0)[None, None]
     estimate = jnp.where(is_free, 1.0 / hessian_diagonal(problem, position), 1.0)
     return jnp.where(is_positive, inverse, unit * estimate[None, None])
+
+
+# --- linear systems ------------------------------------------------------------------------------------------
+
+Operator = Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]]
+
+
+class LinearSolution(NamedTuple):
+    """What became of a linear system H v = b."""
+
+    displacement: Float[Array, "*shape"]  # v [m]
+    residual: Float[Array, ""]  # relative to b, in the preconditioner's norm
+    iterations: Int[Array, ""]
+    is_indefinite: Bool[Array, ""]  # a direction of negative curvature was met
+
+
+class _State(NamedTuple):
+    """A Lanczos process and its QR factorisation; the names are those of the source."""
+
+    x: Array
+    r1: Array  # last Lanczos vector but one, without the preconditioner and not normalised
+    r2: Array  # last one
+    y: Array  # the last one, preconditioned
+    w1: Array  # directions that x was moved along
+    w2: Array
+    beta: Array
+    old_beta: Array
+    cosine: Array
+    sine: Array
+    dbar: Array
+    epsilon: Array
+    phi: Array  # norm of the residual
+    pivot: Array  # of the tridiagonal matrix's factorisation: negative where the matrix is not positive
+    iterations: Array
+    is_indefinite: Array
+
+
+def solve_symmetric(
+    apply: Operator,
+    precondition: Operator,
+    force: Float[Array, "*shape"],
+    *,
+    tolerance: float,
+    iterations: int,
+) -> LinearSolution:
+    """Solve H v = force by preconditioned MINRES.
+
+    Its residual never grows, also where H is indefinite. Conjugate gradients divide by curvatures, and in float32
+    they stall where one is near zero.
+
+    `apply` is the product with H, symmetric, and `precondition` that with an estimate of H^-1, symmetric and
+    positive definite. The tolerance of the residual is relative to the force.
+
+    Source: Paige and Saunders 1975, doi 10.1137/0712047.
+    """
+    y = precondition(force)
+    whole = jnp.sqrt(_inner(force, y))
+    zero, zeros = jnp.zeros((), force.dtype), jnp.zeros_like(force)
+
+    def is_running(state: _State) -> Array:
+        return (state.phi > tolerance * whole) & (state.iterations < iterations) & (state.beta > 0)
+
+    def iterate(s: _State) -> _State:
+        v = s.y / s.beta
+        applied = apply(v) - s.beta / jnp.where(s.old_beta > 0, s.old_beta, 1.0) * s.r1
+        alpha = _inner(v, applied)
+        applied = applied - alpha / s.beta * s.r2
+        y = precondition(applied)
+        beta = jnp.sqrt(jnp.maximum(_inner(applied, y), 0.0))
+
+        delta = s.cosine * s.dbar + s.sine * alpha
+        gbar = s.sine * s.dbar - s.cosine * alpha
+        gamma = jnp.hypot(gbar, beta)
+        gamma = jnp.where(gamma > 0, gamma, jnp.finfo(v.dtype).tiny)
+        cosine, sine = gbar / gamma, beta / gamma
+        w = (v - s.epsilon * s.w1 - delta * s.w2) / gamma
+        lost = jnp.where(s.pivot == 0, 0.0, s.beta**2 / jnp.where(s.pivot == 0, 1.0, s.pivot))
+        pivot = alpha - jnp.where(s.iterations > 0, lost, 0.0)
+        return _State(
+            x=s.x + cosine * s.phi * w,
+            r1=s.r2,
+            r2=applied,
+            y=y,
+            w1=s.w2,
+            w2=w,
+            beta=beta,
+            old_beta=s.beta,
+            cosine=cosine,
+            sine=sine,
+            dbar=-s.cosine * beta,
+            epsilon=s.sine * beta,
+            phi=sine * s.phi,
+            pivot=pivot,
+            iterations=s.iterations + 1,
+            is_indefinite=s.is_indefinite | (pivot < 0),
+        )
+
+    start = _State(
+        x=zeros,
+        r1=zeros,
+        r2=force,
+        y=y,
+        w1=zeros,
+        w2=zeros,
+        beta=whole,
+        old_beta=zero,
+        cosine=-jnp.ones_like(zero),
+        sine=zero,
+        dbar=zero,
+        epsilon=zero,
+        phi=whole,
+        pivot=zero,
+        iterations=jnp.int32(0),
+        is_indefinite=jnp.zeros((), bool),
+    )
+    end = jax.lax.while_loop(is_running, iterate, start)
+    # The recursion's own residual goes on falling where rounding has stopped the true one.
+    left = force - apply(end.x)
+    residual = jnp.sqrt(_inner(left, precondition(left))) / jnp.where(whole > 0, whole, 1.0)
+    return LinearSolution(end.x, residual, end.iterations, end.is_indefinite)
+
+
+def _inner(left: Float[Array, "*shape"], right: Float[Array, "*shape"]) -> Float[Array, ""]:
+    return product(left.ravel(), right.ravel())

@@ -104,12 +104,8 @@ class Air(Term):
             for places in (x, problem.origin)
         )
         normals, wind = tuple(data.normals.T), tuple(data.wind.T)
-        moved = sub3(now, before)
-        through = (
-            moved[0] / timestep - wind[0],
-            moved[1] / timestep - wind[1],
-            moved[2] / timestep - wind[2],
-        )
+        x, y, z = (part / timestep - air for part, air in zip(sub3(now, before), wind, strict=True))
+        through = x, y, z
         across = dot3(through, normals)
         along = dot3(through, through) - across * across
         is_still = along <= 0  # the root has no gradient there
@@ -127,11 +123,7 @@ class Air(Term):
 
 
 def blowing(wind: Sequence[float] | None, gust: float = 0.0) -> Air | None:
-    """Return air with a steady wind, or with gusts; None where there is no wind to blow.
-
-    Args:
-        wind: Mean velocity [m/s]; zeros are still air.
-        gust: Strength of the gusts, see `gusts`.
+    """Return air with a wind of a mean velocity [m/s], steady or in `gusts` of a strength; None without a wind.
 
     Raises:
         ConfigError: There are gusts without a wind, or their strength is negative.
@@ -168,7 +160,6 @@ def _gusty(mean: Array, height: Array, rates: Array, phases: Array, points: Arra
 
 
 def _mean(corners: tuple[Vector3, ...]) -> Vector3:
-    """Return the means of the corners of every face, by components."""
     a, b, c = corners
     third = 1.0 / 3.0
     return (third * (a[0] + b[0] + c[0]), third * (a[1] + b[1] + c[1]), third * (a[2] + b[2] + c[2]))

@@ -28,26 +28,55 @@ from eslr_jax.types import Contacts, Garment, Obstacle
 
 
 class BodyContact(NamedTuple):
-    """Contact of the cloth with the body during a frame."""
+    """Contact of the cloth with the body, or with the ground, during a frame."""
 
     nearest: Contacts
-    opposing: Contacts  # with the body part on the other side of the cloth
-    thickness: Float[Array, ""]  # distance that vertices keep [m], of `contact_thickness`
+    opposing: Contacts | None  # with the body part on the other side of the cloth; None on the ground
+    thickness: Float[Array, ""] | float  # distance that vertices keep [m]
     stiffness: Float[Array, ""]  # [J/m^5]
+
+    @property
+    def sides(self) -> tuple[Contacts, ...]:
+        """What vertices keep off."""
+        return (self.nearest,) if self.opposing is None else (self.nearest, self.opposing)
+
+
+class Barrier(Term):
+    """Vertices of the cloth keep off tangent planes; `prepare` returns a `BodyContact`."""
+
+    name = "collision"
+    on = "vertices"
+    ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "thickness": THICKNESS_RANGE})
+
+    def corner_energies(
+        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: BodyContact
+    ) -> Float[Array, " vertices"]:
+        """Return the energy of every vertex [J]; see `collision_energies`."""
+        limits = problem.garment, data.stiffness, data.thickness
+        first, *others = (collision_energies(corners[0], contacts, *limits) for contacts in data.sides)
+        return sum(others, first)
+
+    def diagonal(self, x: Vector3, problem: FrameProblem, data: BodyContact) -> Float[Array, " vertices"]:
+        """Return a third of the curvature along the normal [N/m]: it acts along one of three axes."""
+        first, *others = (penetration(x, contacts, data.thickness) for contacts in data.sides)
+        return 2.0 * data.stiffness * problem.garment.vertex_areas * sum(others, first)
+
+    def push_out(
+        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: BodyContact
+    ) -> Float[Array, "vertices 3"]:
+        """Return positions [m] with vertices inside the obstacle lifted out of it."""
+        return lifted(position, data.nearest, data.thickness)
 
 
 @struct.dataclass
-class Collision(Term):
+class Collision(Barrier):
     """Vertices of the cloth keep off the tangent planes of the body's nearest points, on both sides.
 
     What comes between vertices is kept out by `Contact`.
     """
 
-    name = "collision"
-    on = "vertices"
     reads_body = True
     unless_needed = "no body in reach"
-    ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "thickness": THICKNESS_RANGE})
 
     stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
     thickness: Float[Array, ""] | float = CONTACT_THICKNESS  # [m], see `problem.contact_thickness`
@@ -77,29 +106,6 @@ class Collision(Term):
             thickness=contact_thickness(garment, self.thickness),
             stiffness=self.stiffness * contact_excess(problem.material),
         )
-
-    def corner_energies(
-        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: BodyContact
-    ) -> Float[Array, " vertices"]:
-        """Return the energy of every vertex [J]; see `collision_energies`."""
-        near, across = (
-            collision_energies(corners[0], contacts, problem.garment, data.stiffness, data.thickness)
-            for contacts in (data.nearest, data.opposing)
-        )
-        return near + across
-
-    def diagonal(self, x: Vector3, problem: FrameProblem, data: BodyContact) -> Float[Array, " vertices"]:
-        """Return a third of the curvature along the normal [N/m]: it acts along one of three axes."""
-        near, across = (
-            penetration(x, contacts, data.thickness) for contacts in (data.nearest, data.opposing)
-        )
-        return 2.0 * data.stiffness * problem.garment.vertex_areas * (near + across)
-
-    def push_out(
-        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: BodyContact
-    ) -> Float[Array, "vertices 3"]:
-        """Return positions [m] with vertices inside the body lifted out of it."""
-        return lifted(position, data.nearest, data.thickness)
 
     def touched(self, problem: FrameProblem, data: BodyContact) -> tuple[Contacts, Float[Array, " vertices"]]:
         """Return the nearest points of the body with the force of the frame before.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.lists import Motion, find_pairs, joint_meshes
+from eslr_jax.contact.lists import Meshes, Motion, find_pairs, joint_meshes
 from eslr_jax.contact.nearest import CLEARANCE, clear_of_body, is_inside
 from eslr_jax.contact.pairs import CHUNK, Met, closest, corners_of
 from eslr_jax.contact.ways import move_clear
@@ -25,6 +25,8 @@ from eslr_jax.terms.problem import (
     STIFFNESS_RANGE,
     THICKNESS_RANGE,
     FrameProblem,
+    MovingBody,
+    free_vertices,
 )
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term
@@ -61,22 +63,20 @@ def _under_skin(
     return body - _GROWTH * vertex_normals(body, surface.faces, surface.face_incidence)
 
 
-def _begun(problem: FrameProblem) -> Float[Array, "vertices 3"]:
+def _begun(problem: FrameProblem) -> Float[Array, "all_vertices 3"]:
     """Return where the ways of cloth, and of the body behind it, begin at t [m].
 
     That is where they are. But cloth inside the body begins on its skin, and then all of the body under it, as at
     a scene's start: so cloth that was put inside, or was let through, comes out again.
     """
-    body, garment, position = problem.body, problem.garment, problem.position
+    body, position = problem.body, problem.position
     if body is None:
         return position
     start, touched = body.start, problem.data_of(Collision)
     if touched is not None:
         nearest = touched.nearest
         depth = jnp.sum((nearest.points - position) * nearest.normals, axis=1)
-        may_be = nearest.is_near & (depth > 0) & garment.vertex_mask
-        if problem.pin_targets is not None:
-            may_be = may_be & ~garment.is_pinned
+        may_be = nearest.is_near & (depth > 0) & free_vertices(problem)
         inside = is_inside(*jax.lax.stop_gradient((may_be, position, start, body.surface)))
         position = jnp.where(inside[:, None], nearest.points + CLEARANCE * nearest.normals, position)
         start = jax.lax.cond(jnp.any(inside), _under_skin, lambda body, _: body, start, body.surface)
@@ -117,6 +117,11 @@ class NearPairs(NamedTuple):
         return jnp.where(self.stiffness > 0, depth, 0.0)
 
 
+def _with_body(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, "all_vertices 3"]:
+    """Return positions of the cloth [m] with the body's at t + 1 behind them."""
+    return position if problem.body is None else jnp.concatenate([position, problem.body.end])
+
+
 def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3]) -> Vector3:
     """Return the weighted sums of four corners [m]."""
     return tuple(  # type: ignore[return-value]
@@ -125,22 +130,16 @@ def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3])
     )
 
 
-class Ends(NamedTuple):
-    """What came of a frame's ends."""
-
-    is_passed: Bool[Array, ""] | bool = False
-    most: Int[Array, ""] | int = 0  # rows that the fullest table would have needed
-    is_far: Bool[Array, ""] | bool = False  # one was pushed by `ways.FAR`
-
-
 class Meetings(NamedTuple):
-    """Pairs of a frame."""
+    """Pairs of a frame, and what came of its ends."""
 
-    start: Float[Array, "vertices 3"]  # of `_begun`
+    start: Float[Array, "all_vertices 3"]  # of `_begun`
     near: NearPairs
     most_near: Int[Array, ""]  # that the fuller table of them would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
-    ends: Ends = Ends()
+    is_passed: Bool[Array, ""] | bool = False
+    most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
+    is_far: Bool[Array, ""] | bool = False  # an end was pushed by `ways.FAR`
 
 
 @struct.dataclass
@@ -153,10 +152,10 @@ class Contact(Term):
 
     An energy can be overcome, and pairs that come near within the frame have none. So the positions that the
     frame would end with are pushed until no pair has met on the straight ways from the frame's start. Cloth that
-    starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed far, pairs that met on the way get the energy too, along the
-    direction that parted them last, and the frame is solved once more. The body yields where its own parts pass
-    through each other (`mesh.parting`). Where that does not make room, something is let through, and the
-    trajectory says in which frame.
+    starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed
+    far, pairs that met on the way get the energy too, along the direction that parted them last, and the frame is
+    solved once more. The body yields where its own parts pass through each other (`mesh.parting`). Where that
+    makes no room, something is let through, and the trajectory says in which frame.
 
     A derivative takes no notice of the pushes.
 
@@ -172,9 +171,8 @@ class Contact(Term):
     # [J/m^5] Twice that of vertices: with one, half as much again is left to pushes; with four, tolerance takes a
     # tenth more iterations.
     stiffness: Float[Array, ""] | float = 2.0 * CONTACT_STIFFNESS
-    thickness: Float[Array, ""] | float = (
-        1e-3  # [m] of every cloth of a pair: layers keep 2 mm, as off the body
-    )
+    # [m] of every cloth of a pair: layers keep 2 mm, as off a body.
+    thickness: Float[Array, ""] | float = 1e-3
     rows: int | None = struct.field(pytree_node=False, default=None)  # of either table; None: to be planned
     has_layers: bool = struct.field(pytree_node=False, default=True)  # cloth does not pass through cloth
     # [m] by which cloth that the first pose folds through itself is moved, see `mesh.parting.uncrossed`
@@ -214,28 +212,33 @@ class Contact(Term):
             jnp.zeros_like(position.T),
             under.T,
             (now - under).T,
-            joint_meshes(garment, body.surface, has_layers=self.has_layers),
+            self._meshes(garment, body),
             garment.vertex_mask & ~garment.is_pinned,
             self._num_rows(len(position)),
         )
         return grown.position.T
 
+    def _meshes(self, garment: Garment, body: Obstacle | MovingBody | None) -> Meshes:
+        return joint_meshes(garment, None if body is None else body.surface, has_layers=self.has_layers)
+
     def _num_rows(self, num_vertices: int) -> int:
         return starting_rows(num_vertices) if self.rows is None else self.rows
 
+    def _near_rows(self, num_vertices: int) -> int:
+        return max(self._num_rows(num_vertices) // _NEAR_SHARE, _LEAST_NEAR)
+
     def prepare(self, problem: FrameProblem) -> Meetings:
         """Return the pairs that are near at t."""
-        garment, body, count = problem.garment, problem.body, len(problem.position)
+        count = len(problem.position)
         start = _begun(problem)
-        end = start if body is None else jnp.concatenate([start[:count], body.end])
+        end = _with_body(start[:count], problem)
         x, y = components(start), components(end)
         is_cloth = jnp.arange(len(start)) < count
         half = 0.5 * _NEAR_CLOTH
         radius = jnp.where(is_cloth, half, _NEAR_BODY - half).astype(start.dtype)
         still = jax.tree.map(jnp.zeros_like, x)
-        meshes = joint_meshes(garment, None if body is None else body.surface, has_layers=self.has_layers)
         motion = jax.lax.stop_gradient(Motion(x, still, radius))
-        found = find_pairs(motion, meshes, self._near_rows(count))
+        found = find_pairs(motion, self._meshes(problem.garment, problem.body), self._near_rows(count))
         kinds = []
         for rows, is_edge in found.pairs.kinds:
             here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
@@ -309,26 +312,17 @@ class Contact(Term):
 
         return jax.lax.fori_loop(0, _SWEEPS, sweep, position)
 
-    def _near_rows(self, num_vertices: int) -> int:
-        return max(self._num_rows(num_vertices) // _NEAR_SHARE, _LEAST_NEAR)
-
     def correct(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Meetings
     ) -> tuple[Float[Array, "vertices 3"], Meetings]:
         """Return positions at t + 1 [m] that are reached without crossing, and what came of it."""
-        garment, body, count = problem.garment, problem.body, len(position)
-        is_free = garment.vertex_mask
-        if problem.pin_targets is not None:
-            is_free = is_free & ~garment.is_pinned
-
-        end = position if body is None else jnp.concatenate([position, body.end])
+        count, end = len(position), _with_body(position, problem)
         start = data.start.T
         ways = end.T - start
-        surface = None if body is None else body.surface
         ended = move_clear(
             *jax.lax.stop_gradient((start[:, :count], ways[:, :count], start[:, count:], ways[:, count:])),
-            joint_meshes(garment, surface, has_layers=self.has_layers),
-            is_free,
+            self._meshes(problem.garment, problem.body),
+            free_vertices(problem),
             self._num_rows(count),
             self._near_rows(count),
         )
@@ -339,10 +333,11 @@ class Contact(Term):
             lambda: jax.lax.stop_gradient(self._with_met(data, ended.met, end, problem)),
             lambda: jax.lax.stop_gradient(data.near),
         )
-        return position + pushed, data._replace(near=near, ends=Ends(ended.is_passed, ended.most, is_far))
+        found = data._replace(near=near, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
+        return position + pushed, found
 
     def _with_met(
-        self, data: Meetings, met: tuple[Met, Met], end: Float[Array, "vertices 3"], problem: FrameProblem
+        self, data: Meetings, met: tuple[Met, Met], end: Float[Array, "all_vertices 3"], problem: FrameProblem
     ) -> NearPairs:
         """Return near pairs and those that cloth would meet on its way, as far as the table holds them."""
         start, near = data.start, data.near
@@ -380,21 +375,21 @@ class Contact(Term):
     def status(self, problem: FrameProblem, data: Meetings) -> Int[Array, ""]:
         """Return whether a table was too small."""
         count = len(problem.position)
-        is_full = (data.most_near > self._near_rows(count)) | (data.ends.most > self._num_rows(count))
+        is_full = (data.most_near > self._near_rows(count)) | (data.most > self._num_rows(count))
         return jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
 
     def is_passed(self, data: Meetings) -> Bool[Array, ""] | None:
         """Return whether something was let through."""
-        return jnp.asarray(data.ends.is_passed)
+        return jnp.asarray(data.is_passed)
 
     def is_far(self, data: Meetings) -> Bool[Array, ""] | bool:
         """Return whether an end was pushed so far that cloth around it has to follow."""
-        return data.ends.is_far
+        return data.is_far
 
     def demand(self, data: Meetings) -> Int[Array, ""]:
         """Return the rows that the fullest search asked for."""
         near = jnp.where(data.most_near > _LEAST_NEAR, _NEAR_SHARE * data.most_near, 0)
-        return jnp.maximum(near, data.ends.most)
+        return jnp.maximum(near, data.most)
 
     def enlarged(self, demand: int) -> Contact | None:
         """Return itself with tables for so many rows and half as many more; None where they have room.

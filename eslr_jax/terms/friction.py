@@ -81,15 +81,10 @@ def friction_energies(
 ) -> Float[Array, " vertices"]:
     """Return mu N_v (sqrt(|u_v|^2 + s^2) - s) of every vertex [J], whose force tends to mu N_v against the slip.
 
-    u is the motion relative to the body point under the vertex, within the true tangent plane at t + 1.
-
-    Args:
-        position: Vertex positions at t + 1 [m].
-        start: Vertex positions at t [m].
-        contacts: Body points at t and t + 1.
-        force: Coulomb's mu times the normal force N [N], lagged: the contact force at t, so that the energy
-            stays a potential.
-        slip: Sliding distance s [m] below which friction acts like a spring.
+    u is the motion from `start`, at t, to `position`, at t + 1 [m], relative to the body point under the vertex,
+    within the true tangent plane at t + 1. `force` is Coulomb's mu times the normal force N [N], lagged: the
+    contact force at t, so that the energy stays a potential. `slip` is the distance s [m] below which friction is
+    a spring.
 
     Source: lagged friction as in Li et al. 2020 (IPC), doi 10.1145/3386569.3392425, eq. 15.
     """
@@ -103,11 +98,8 @@ def slip_energies(
 ) -> Float[Array, " rows"]:
     """Return the energies of `friction_energies` [J], from relative motions [m] and unit normals."""
     along_normal = dot3(motion, normal)
-    tangential = (
-        motion[0] - along_normal * normal[0],
-        motion[1] - along_normal * normal[1],
-        motion[2] - along_normal * normal[2],
-    )
+    x, y, z = (part - along_normal * axis for part, axis in zip(motion, normal, strict=True))
+    tangential = x, y, z
     squared = dot3(tangential, tangential)
     # squared / (sqrt(squared + s^2) + s) equals sqrt(squared + s^2) - s without its cancellation.
     (force,) = in_memory(force)

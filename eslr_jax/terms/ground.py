@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,47 +12,28 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.ground import clear_of_ground, ground_contacts
 from eslr_jax.errors import ConfigError
-from eslr_jax.numerics import Vector3
 from eslr_jax.ranges import Range, check_number
-from eslr_jax.terms.collision import collision_energies, contact_forces, lifted, penetration
-from eslr_jax.terms.problem import (
-    CONTACT_STIFFNESS,
-    CONTACT_THICKNESS,
-    STIFFNESS_RANGE,
-    THICKNESS_RANGE,
-    FrameProblem,
-)
+from eslr_jax.terms.collision import Barrier, BodyContact, contact_forces
+from eslr_jax.terms.problem import CONTACT_STIFFNESS, CONTACT_THICKNESS, FrameProblem
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Term
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Contacts, Garment, Obstacle
 
 
-class GroundContact(NamedTuple):
-    """Contact of the cloth's vertices with the ground during a frame."""
-
-    contacts: Contacts  # the points of the ground under the vertices
-    stiffness: Float[Array, ""]  # [J/m^5]
-
-
 @struct.dataclass
-class Ground(Term):
+class Ground(Barrier):
     """A level ground, which no vertex passes.
 
     Without a height it lies under the lowest point of the moving body, where cloth could reach it. It is flat and
-    stands still: no edge dips into it, and where the cloth
-    is tells how hard it presses.
+    stands still: no edge dips into it, and where the cloth is tells how hard it presses.
     """
 
-    name = "collision"
-    on = "vertices"
     unless_needed = "out of reach"
-    ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "thickness": THICKNESS_RANGE})
 
     height: Float[Array, ""] | float | None = None  # [m]; None: to be planned
-    is_always: bool = struct.field(
-        pytree_node=False, default=False
-    )  # modelled also where no cloth reaches it
+    # Modelled also where no cloth reaches it.
+    is_always: bool = struct.field(pytree_node=False, default=False)
     stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
     thickness: Float[Array, ""] | float = CONTACT_THICKNESS  # distance that vertices keep [m]
 
@@ -65,11 +45,8 @@ class Ground(Term):
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Ground | None:
         """Return the ground under the body, or None where no cloth could reach it."""
-        if self.height is not None:
-            return self.replace(height=np.float32(self.height))
-        if not (self.is_always or worn.could_fall() or worn.reaches(worn.lowest_point)):
-            return None
-        return self.replace(height=np.float32(worn.lowest_point))
+        is_needed = self.height is not None or self.is_always or worn.could_fall()
+        return self.alike(worn, ()) if is_needed or worn.reaches(worn.lowest_point) else None
 
     def alike(self, worn: Worn, planned: Sequence[Any]) -> Ground:
         """Return the ground under this scene's body."""
@@ -82,36 +59,17 @@ class Ground(Term):
         height = jnp.asarray(self.height, position.dtype)
         return clear_of_ground(position, height, garment.is_pinned)
 
-    def prepare(self, problem: FrameProblem) -> GroundContact:
+    def prepare(self, problem: FrameProblem) -> BodyContact:
         """Return the points of the ground under the vertices."""
         if self.height is None:
             raise ConfigError("a ground without a height; give it one, or take the terms of plan_scene")
         contacts = ground_contacts(problem.position, jnp.asarray(self.height, problem.position.dtype))
-        return GroundContact(contacts, self.stiffness * contact_excess(problem.material))
+        return BodyContact(contacts, None, self.thickness, self.stiffness * contact_excess(problem.material))
 
-    def corner_energies(
-        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: GroundContact
-    ) -> Float[Array, " vertices"]:
-        """Return the energy of every vertex [J]; see `collision_energies`."""
-        return collision_energies(corners[0], data.contacts, problem.garment, data.stiffness, self.thickness)
-
-    def diagonal(self, x: Vector3, problem: FrameProblem, data: GroundContact) -> Float[Array, " vertices"]:
-        """Return a third of the curvature along the normal [N/m]."""
-        depth = penetration(x, data.contacts, self.thickness)
-        return 2.0 * data.stiffness * problem.garment.vertex_areas * depth
-
-    def push_out(
-        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: GroundContact
-    ) -> Float[Array, "vertices 3"]:
-        """Return positions [m] with vertices lifted out of the ground."""
-        return lifted(position, data.contacts, self.thickness)
-
-    def touched(
-        self, problem: FrameProblem, data: GroundContact
-    ) -> tuple[Contacts, Float[Array, " vertices"]]:
+    def touched(self, problem: FrameProblem, data: BodyContact) -> tuple[Contacts, Float[Array, " vertices"]]:
         """Return the points of the ground with the forces at t."""
-        limits = data.stiffness, self.thickness
-        return data.contacts, contact_forces(problem.position, data.contacts, problem.garment, *limits)
+        limits = problem.garment, data.stiffness, data.thickness
+        return data.nearest, contact_forces(problem.position, data.nearest, *limits)
 
     def describe(self, garment: Garment) -> str:
         """Return where it is."""

@@ -45,20 +45,14 @@ class Term:
     ranges: ClassVar[Mapping[str, Range]] = MappingProxyType({})  # of its constants, each one number
 
     def check(self) -> None:
-        """Check its constants (host).
-
-        Raises:
-            ConfigError: One is not finite or out of its range.
-        """
+        """Raise a ConfigError where one of its constants is not finite or out of its range (host)."""
         for field, accepted in self.ranges.items():
             check_number(f"{self.name} {field}", getattr(self, field), accepted)
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Term | None:
         """Return the term as a scene holds it, or None where the scene does not need it (host).
 
-        Args:
-            worn: The garment and the motion of the body that wears it.
-            others: Terms that stand before it, planned.
+        It depends on the worn garment, and on the terms that stand before it, planned.
         """
         return self
 
@@ -69,9 +63,7 @@ class Term:
     def alike(self, worn: Worn, planned: Sequence[Any]) -> Term:
         """Return the term for one scene of a batch, in the shape that all of them share (host).
 
-        Args:
-            worn: The garment and the motion of this scene.
-            planned: The term as those scenes of the batch hold it that need it.
+        `planned` is the term as those scenes of the batch hold it that need it.
         """
         return planned[0]
 
@@ -133,13 +125,7 @@ class Term:
     def corner_energies(
         self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
     ) -> Float[Array, " elements"]:
-        """Return the energy of every face, hinge or vertex [J].
-
-        Args:
-            corners: Positions at t + 1 of the elements' corners, by components [m].
-            problem: The frame's problem.
-            data: Of `prepare`.
-        """
+        """Return the energy of every face, hinge or vertex [J], by components of its corners at t + 1 [m]."""
         raise TypeError(f"{type(self).__name__} needs `corner_energies` or `elements`")
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
@@ -176,11 +162,7 @@ class Term:
 
 
 def find_term(name: str) -> type[Term]:
-    """Return the term of MODULE:CLASS; the module is imported (host).
-
-    Raises:
-        ConfigError: There is no such module, or it has no such term.
-    """
+    """Return the term of MODULE:CLASS; a ConfigError where there is no such module or term (host)."""
     module, _, kind = name.partition(":")
     found = getattr(import_own(module, f"term {name}"), kind, None) if module and kind else None
     if not (isinstance(found, type) and issubclass(found, Term)):

@@ -38,34 +38,17 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager((folder / _FOLDER).absolute(), options=options)
 
     def save(self, state: TrainState) -> None:
-        """Start writing a checkpoint; the state may be donated as soon as this returns.
-
-        Source: orbax copies to the host before it returns, and renames the folder when it is whole.
-
-        Raises:
-            CheckpointError: This checkpoint, or the one before it, could not be written.
-        """
+        """Start to write a checkpoint of a state, copied first; a CheckpointError where one can't be written."""
         with _explained():
             self._manager.save(int(state.step), args=ocp.args.StandardSave(_plain(state)))
 
     def wait(self) -> None:
-        """Wait for what is being written, and raise its error.
-
-        Raises:
-            CheckpointError: The checkpoint could not be written, as on a full disk.
-        """
+        """Wait for what is being written; a CheckpointError where it could not be, as on a full disk."""
         with _explained():
             self._manager.wait_until_finished()
 
     def restore(self, example: TrainState) -> TrainState:
-        """Return the newest checkpoint that can be read, and move newer ones aside, which can't.
-
-        Args:
-            example: A state of the same run: its shapes and types.
-
-        Raises:
-            CheckpointError: There is none, or none can be read.
-        """
+        """Return the newest checkpoint that can be read, like `example`; damaged ones are moved aside."""
         steps = sorted(self._manager.all_steps(), reverse=True)
         if not steps:
             raise CheckpointError("there is no checkpoint to resume from; start without --resume")
@@ -133,11 +116,7 @@ def write_run_config(folder: Path, config: TrainConfig, earlier: Mapping[str, An
 
 
 def read_run_config(folder: Path) -> TrainConfig:
-    """Return the configuration of a run.
-
-    Raises:
-        CheckpointError: The folder holds no run, or one of a newer format.
-    """
+    """Return the configuration of a run; a CheckpointError where there is none, or one of a newer format."""
     path = folder / "config.json"
     try:
         record = json.loads(path.read_text())

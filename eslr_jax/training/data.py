@@ -30,11 +30,6 @@ class Shapes:
     joints: Float[Array, "frames joints 3 shapes"]  # of the offsets in the joints' transforms
     garments: Float[Array, "garments vertices 3 shapes"]  # of the skinned start; lengths at rest stay
 
-    @property
-    def count(self) -> int:
-        """Number of shape coefficients."""
-        return self.surface.shape[-1]
-
 
 @struct.dataclass
 class TrainingData:
@@ -110,13 +105,9 @@ class TrainingData:
 def build_training_data(
     garments: list[Garment], body: Body, motions: list[Motion], *, has_shapes: bool = False
 ) -> TrainingData:
-    """Return what training samples from.
+    """Return what training samples from: garments padded to equal sizes, the body that wears them, and its clips.
 
-    Args:
-        garments: Garments padded to equal sizes.
-        body: The body that wears them.
-        motions: Its clips.
-        has_shapes: Trajectories draw the coefficients of the body's shape.
+    With `has_shapes` trajectories draw the coefficients of the body's shape.
 
     Raises:
         ConfigError: The garments are not near the body, no clip has two frames, or the body has no shapes and

@@ -61,13 +61,12 @@ def train(
 
     Args:
         config: The run. A run that is resumed may have more `steps` than before.
-        datasets: What to train on, one per resolution: of `build_training_data`, or the bundled garments and
-            clips that `config` names, of `pipeline.assets.training.load_training_data`.
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
         initial: Network whose weights to start from instead of random ones.
         earlier: Training record of that network, whose steps and core-hours the exported one counts too. A run
             that is resumed knows it.
+        datasets: Of `build_training_data`, one per resolution.
         on_progress: Called with steps done, steps in all, and the latest line of metrics of the first seed.
         most_seconds: Of clock time after which this part of the run ends with a checkpoint, as by Ctrl-C; of one
             process.
@@ -79,7 +78,6 @@ def train(
         CheckpointError: `out` holds another run, or none to resume; or `initial` does not fit `config.model`.
         ConfigError: Several seeds would be spread over devices, or several processes would end by their clocks.
         NonFiniteError: Too many updates in a row had to be skipped; the last good checkpoint is kept.
-        CapacityError: Self-contact needed more room than its buffers have.
     """
     mesh = make_mesh(config)
     if config.seeds > 1 and mesh is not None:
@@ -123,14 +121,11 @@ def train(
             window.append(metrics)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
-                of_seeds = window_metrics(window, len(folders))
+                seconds = time.perf_counter() - began
+                shared = {"step": done, "seconds": seconds, "core_seconds": spent + time.process_time()}
+                shared["its"] = (done - first) / seconds
+                records = [shared | own for own in window_metrics(window, len(folders))]
                 window = []
-                speed = (done - first) / (time.perf_counter() - began)
-                seconds = {
-                    "seconds": time.perf_counter() - began,
-                    "core_seconds": spent + time.process_time(),
-                }
-                records = [{"step": done, **seconds, "its": speed, **own} for own in of_seeds]
                 for log, record in zip(logs, records, strict=True):
                     log.write(json.dumps(record) + "\n")
                     log.flush()
@@ -154,7 +149,6 @@ def train(
 def _first_state(
     config: TrainConfig, datasets: tuple[TrainingData, ...], initial: Network | None
 ) -> TrainState:
-    """Return the state before the first step, of several seeds stacked."""
     states = [init_train_state(one, datasets) for one in seed_configs(config)]
     if initial is not None:  # copies, since a step donates its state
         initial = initial.replace(config=config.model)
@@ -223,28 +217,22 @@ def window_metrics(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[
     """
     fetched = jax.device_get(window)
     columns = {name: np.stack([np.reshape(entry[name], seeds) for entry in fetched]) for name in fetched[0]}
-    means = []
-    for place in range(seeds):
-        own = {name: values[:, place] for name, values in columns.items()}
+
+    def of_seed(own: dict[str, np.ndarray]) -> dict[str, float]:
         is_good = own["skipped"] == 0
         taken = is_good if np.any(is_good) else ~is_good
-        means.append(
-            {
-                name: float(np.mean(values) if name in _SHARES else np.median(values[taken]))
-                for name, values in own.items()
-            }
-        )
-    return means
+        return {
+            name: float(np.mean(values) if name in _SHARES else np.median(values[taken]))
+            for name, values in own.items()
+        }
+
+    return [of_seed({name: values[:, place] for name, values in columns.items()}) for place in range(seeds)]
 
 
 def _check_skipped(
     state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path, earlier: Mapping[str, Any]
 ) -> None:
-    """Stop a run that produces nothing but NaN; its weights are good, as such updates are not applied.
-
-    One such update now and then is none: its trajectory starts anew, and the next good update begins the count
-    again.
-    """
+    """Stop a run that produces nothing but NaN; its weights are good, as such updates are not applied."""
     skipped = int(np.max(state.skipped))
     if skipped <= config.max_skipped:
         return
@@ -268,9 +256,7 @@ def seed_configs(config: TrainConfig) -> list[TrainConfig]:
 
 def seed_folders(config: TrainConfig, out: Path) -> list[Path]:
     """Return where metrics and network of each seed lie: `out`, or with several seeds a folder for each."""
-    if config.seeds == 1:
-        return [out]
-    return [out / f"seed-{one.seed}" for one in seed_configs(config)]
+    return [out] if config.seeds == 1 else [out / f"seed-{one.seed}" for one in seed_configs(config)]
 
 
 def stack_seeds(states: list[TrainState]) -> TrainState:
@@ -288,21 +274,18 @@ def take_seed(state: TrainState, place: int) -> TrainState:
 def make_seeds_step(config: TrainConfig, resolution: int) -> Callable:
     """Return the jitted step of all seeds: (states, data) -> (states, metrics); the states are donated.
 
-    The seeds are a batch axis of one step: at 1k vertices a GPU spends it on starting kernels, whose number does
-    not grow with the seeds.
-
-    Arguments are those of `make_train_step`.
+    The seeds are a batch axis of the step of `make_train_step`: at 1k vertices a GPU spends it on starting
+    kernels, whose number does not grow with the seeds.
     """
     step = jax.vmap(make_train_step(config, resolution), in_axes=(_AXES, None), out_axes=(_AXES, 0))
     return jax.jit(step, donate_argnums=0)
 
 
 def keep_memory() -> None:
-    """Make glibc keep freed memory: one arena, no mapping per allocation, nothing given back.
+    """Make glibc, if any, keep freed memory: one arena, no mapping per allocation, nothing given back.
 
     A training step on a CPU takes a hundred megabytes of temporary buffers and frees them. By default glibc
-    returns them to the kernel, and a third of a step is page faults. Call it before the first array. Without
-    glibc it does nothing.
+    returns them to the kernel, and a third of a step is page faults. Call it before the first array.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is None:

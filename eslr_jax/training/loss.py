@@ -75,10 +75,9 @@ def _mean_start_error(
 ) -> Float[Array, ""]:
     """Return how far predictions are from the optimum: mean logarithm of the shares of gap and squared distance.
 
-    All are positions [m] with their potential [J]; predictions along a leading axis of steps.
-
-    Both shares are relative to the pushed-out inertial guess. The gap alone is mostly stretch, which the solver's
-    first iterations remove. The solver needs many iterations where distances are long and energies small.
+    All are positions [m] with their potential [J]; predictions along a leading axis of steps. Both shares are
+    relative to the pushed-out inertial guess. The gap alone is mostly stretch, which the solver's first
+    iterations remove. The solver needs many iterations where distances are long and energies small.
     """
 
     def squared_distance(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:

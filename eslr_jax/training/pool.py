@@ -56,8 +56,8 @@ def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], conf
     yaw = jax.random.uniform(keys[1], maxval=2 * jnp.pi)
     shape = None
     if data.shapes is not None:
-        bound = config.shape_range
-        shape = jax.random.uniform(keys[5], (data.shapes.count,), minval=-bound, maxval=bound)
+        bound, count = config.shape_range, data.shapes.surface.shape[-1]
+        shape = jax.random.uniform(keys[5], (count,), minval=-bound, maxval=bound)
     is_still = jax.random.uniform(keys[6]) < config.still_probability
     # A clip's first frame has none before it: there the clip turns round.
     before = jnp.where(is_still, frame, jnp.where(data.is_same_clip(frame - 1, frame), frame - 1, frame + 1))

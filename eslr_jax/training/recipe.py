@@ -15,13 +15,10 @@ from eslr_jax.networks.registry import read_system
 
 
 def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> TrainConfig:
-    """Read a training configuration; see `registry.read_system` for its `model`.
+    """Read a training configuration from a TOML file; see `registry.read_system` for its `model`.
 
-    A file with `base`, the path of another one from where it is, changes that one's values.
-
-    Args:
-        path: TOML file.
-        overrides: Dotted keys and their values, such as {"model.refinement_steps": 4}.
+    A file with `base`, the path of another one from where it is, changes that one's values. `overrides` are
+    dotted keys and their values, such as {"model.refinement_steps": 4}.
 
     Raises:
         ConfigError: The file is missing or not TOML, or a value is unknown or impossible.
@@ -44,11 +41,7 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
 
 
 def read_train_config(values: Mapping[str, Any]) -> TrainConfig:
-    """Return a training configuration from plain values.
-
-    Raises:
-        ConfigError: A value is unknown or impossible.
-    """
+    """Return a training configuration from plain values; a ConfigError where one is unknown or impossible."""
     return from_dict(TrainConfig, {**values, "model": read_system(values["model"])})
 
 
@@ -59,7 +52,6 @@ def describe_train_config(config: TrainConfig) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the values of a TOML file; raise a ConfigError where it is missing or not TOML."""
     try:
         return tomllib.loads(path.read_text())
     except (FileNotFoundError, IsADirectoryError) as error:

@@ -87,11 +87,7 @@ def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) ->
 
 
 def make_mesh(config: TrainConfig) -> Mesh | None:
-    """Return all devices as one axis that a batch is spread over; None for a single device.
-
-    Raises:
-        ConfigError: The batch cannot be spread evenly.
-    """
+    """Return all devices as one axis, None for a single one; a ConfigError where they can't share a batch."""
     devices = jax.devices()
     if len(devices) == 1 or (config.batch_size == 1 and jax.process_count() == 1):
         return None
@@ -153,12 +149,10 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, network.params)
         trained = optax.apply_updates(network.params, updates)
-        graphs = jax.tree.map(
-            lambda leaf: leaf.reshape(size * config.frames, *leaf.shape[2:]), samples.statistics
-        )
         seen = network
-        for graph in range(size * config.frames if graphs else 0):
-            seen = merge_statistics(seen, jax.tree.map(lambda leaf: leaf[graph], graphs))  # noqa: B023
+        for one, frame in np.ndindex(size, config.frames if samples.statistics else 0):
+            measured = jax.tree.map(lambda leaf: leaf[one, frame], samples.statistics)  # noqa: B023
+            seen = merge_statistics(seen, measured)
         network = network.replace(
             params=_choose(is_learning, trained, network.params),
             statistics=_choose(is_good, seen.statistics, network.statistics),
@@ -166,23 +160,20 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         pool = jax.tree.map(lambda all_, some: all_.at[indices].set(some), pool, samples.slot)
         metrics = {name: jnp.mean(values) for name, values in samples.metrics.items()}
         metrics |= {"gradient_norm": norm, "skipped": (~is_good).astype(jnp.float32)}
-        return (
-            TrainState(
-                network=network,
-                optimizer=_choose(is_learning, optimizer, state.optimizer),
-                pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
-                key=jax.random.key_data(key),
-                step=state.step + 1,
-                skipped=jnp.where(is_good, 0, state.skipped + 1),
-            ),
-            metrics,
+        state = TrainState(
+            network=network,
+            optimizer=_choose(is_learning, optimizer, state.optimizer),
+            pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
+            key=jax.random.key_data(key),
+            step=state.step + 1,
+            skipped=jnp.where(is_good, 0, state.skipped + 1),
         )
+        return state, metrics
 
     return train_step
 
 
 def _choose(is_new: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """Return one of two trees."""
     return jax.tree.map(lambda one, other: jnp.where(is_new, one, other), new, old)
 
 

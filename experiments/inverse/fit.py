@@ -15,7 +15,7 @@ import numpy as np
 from harness import keep, parser
 
 from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene
-from eslr_jax.mesh.rest_shape import with_rest_positions
+from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.motion import still_motion

@@ -5,10 +5,10 @@ import pytest
 
 from eslr_jax import ConfigError
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.embedding import geodesic_embedding
 from eslr_jax.mesh.geodesic import (
     farthest_point_landmarks,
     geodesic_distances,
+    geodesic_embedding,
     geodesic_graph,
     unfolded_shortcuts,
 )

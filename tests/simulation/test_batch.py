@@ -24,7 +24,7 @@ from eslr_jax import (
 )
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.mesh.coarse import add_coarse_edges
-from eslr_jax.mesh.rest_shape import with_rest_positions
+from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_scenes, stack_scenes
 from eslr_jax.simulation.plan import shared_surface
 from eslr_jax.simulation.simulate import raise_for_status

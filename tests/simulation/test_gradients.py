@@ -24,7 +24,7 @@ from eslr_jax import (
     scene_terms,
 )
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.mesh.rest_shape import with_rest_positions
+from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.simulate import raise_for_status

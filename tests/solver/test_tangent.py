@@ -11,10 +11,9 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax import prepare_scene
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.solver.minres import solve_symmetric
 from eslr_jax.solver.potential import potential
 from eslr_jax.solver.preconditioner import sum_diagonals
-from eslr_jax.solver.tangent import apply, inverse_diagonal, precondition, tangent
+from eslr_jax.solver.tangent import apply, inverse_diagonal, precondition, solve_symmetric, tangent
 from eslr_jax.terms import CLOTH, FAST, Air, Contact, Damping
 
 

@@ -14,7 +14,7 @@ from newton_oracle import minimize_newton, potential_float64
 from eslr_jax import ConfigError, prepare_scene
 from eslr_jax.fabric.materials import COTTON, Weave
 from eslr_jax.mesh.plate import warp_directions
-from eslr_jax.mesh.rest_shape import with_rest_positions
+from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.pipeline.fabrics import Described, describe_fabric, on_threads
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.solver.guess import initial_guess
