@@ -57,6 +57,11 @@ def machine() -> dict[str, Any]:
     return {"device": device_name(), "environment": environment()}
 
 
+def cores() -> int | None:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
 def kept(path: Path) -> dict[str, Any]:
     """Return a result that was kept before; empty without one."""
     return json.loads(path.read_text()) if path.exists() else {}

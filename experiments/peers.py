@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blender_cloth import blender_python, run_blender
-from harness import keep, kept, markdown, parser
+from harness import cores, keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
 from eslr_jax import SimConfig, Trajectory, score_trajectory
@@ -136,14 +136,13 @@ def take_turns(
     return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
 
 
-def teach(
-    methods: list[Method], scene: Scene, truth: Trajectory, every: int
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return every method's gap [J] a frame after every so many states of `truth`, and the initial gaps [J]."""
-    ends = trajectory_gap(truth, scene, every=every)
+def teach(methods: list[Method], scene: Scene) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return every method's gap [J] a frame after near-optimal states, and the initial gaps [J]."""
+    truth = rollout_scene(None, scene, SimConfig(iterations=500))
+    ends = trajectory_gap(truth, scene, every=EVERY)
     states, inputs = trajectory_states(truth, scene)
-    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
-    frames = range(1, scene.num_frames - 1, every)
+    taken = jax.tree.map(lambda leaf: leaf[1::EVERY], (states, inputs))
+    frames = range(1, scene.num_frames - 1, EVERY)
     gap = []
     for method in methods:
         reached = [
@@ -155,7 +154,7 @@ def teach(
     return gap, np.asarray(ends.initial_gap)
 
 
-def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[str, Any]:
+def describe_rollout(positions: np.ndarray, scene: Scene, every: int = EVERY) -> dict[str, Any]:
     """Return the measures of a free rollout, gap every so many frames; None where it did not stay finite."""
     try:
         score = score_trajectory(positions, scene, every=every)
@@ -170,7 +169,6 @@ def measure_scene(
     strictly: tuple[tuple[int, int], ...],
     settings: tuple[Setting, ...],
     blender: tuple[tuple[int, int], ...],
-    every: int,
 ) -> list[dict[str, Any]]:
     """Return a row of plain values per method and effort: ours, with strict contact, Newton's, Blender's."""
     methods = [our_method(scene, *effort) for effort in efforts]
@@ -179,24 +177,23 @@ def measure_scene(
         strict = scene.replace(terms=(*scene.terms, Contact(rows=rows)))
         methods += [our_method(strict, *effort, "ours, strict") for effort in strictly]
     methods += newton_methods(scene, settings)
-    truth = rollout_scene(None, scene, SimConfig(iterations=500))
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
-    gap, initial = teach(methods, scene, truth, every)
+    gap, initial = teach(methods, scene)
     rows = [
         {
             "method": method.name,
             "effort": method.effort,
             "frame_ms": float(np.median(wall[k])),
             "frame_cpu_ms": float(np.median(processor[k])),
-            **describe_rollout(positions[k], scene, every),
+            **describe_rollout(positions[k], scene),
             **summarize_gap(gap[k], initial),
         }
         for k, method in enumerate(methods)
     ]
-    return rows + blender_rows(scene, blender, every)
+    return rows + blender_rows(scene, blender)
 
 
-def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int) -> list[dict[str, Any]]:
+def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
     """Return a row per effort of Blender's; none, and a line that says what is missing, without it."""
     if blender_python() is None:
         print("Blender left out: BLENDER_PYTHON names no Python with bpy", file=sys.stderr)
@@ -208,7 +205,7 @@ def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int)
             "effort": f"{steps}x{rounds}",
             "frame_ms": float(np.median(run.wall)),
             "frame_cpu_ms": float(np.median(run.processor)),
-            **describe_rollout(run.positions, scene, every),
+            **describe_rollout(run.positions, scene),
         }
         for (steps, rounds), run in zip(efforts, runs, strict=True)
     ]
@@ -230,22 +227,25 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
     methods += [newton_methods(scene, settings) for scene in scenes[1:]]
     _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
     for scene, of_scene in zip(scenes, methods, strict=True):
-        truth = rollout_scene(None, scene, SimConfig(iterations=500))
-        gap, initial = teach(of_scene, scene, truth, EVERY)
+        gap, initial = teach(of_scene, scene)
         relative.append([np.maximum(values, 0.0) / initial for values in gap])
     points: dict[str, list[dict[str, Any]]] = {}
     for k, method in enumerate(methods[0]):
         shares = np.concatenate([values[k] for values in relative])
         if np.isfinite(shares).all():
-            points.setdefault(method.name, []).append(
-                {
-                    "iterations": method.effort,
-                    "frame_ms": float(np.median(wall[k])),
-                    "gap_relative_median": float(np.median(shares)),
-                    "gap_relative_p99": float(np.quantile(shares, 0.99)),
-                }
-            )
+            row = point(method.effort, float(np.median(wall[k])), shares)
+            points.setdefault(method.name, []).append(row)
     return points
+
+
+def point(iterations: int | str, frame_ms: float, shares: np.ndarray) -> dict[str, Any]:
+    """Return a point of speed against error; shares are gaps relative to the initial gap."""
+    return {
+        "iterations": iterations,
+        "frame_ms": frame_ms,
+        "gap_relative_median": float(np.median(shares)),
+        "gap_relative_p99": float(np.quantile(shares, 0.99)),
+    }
 
 
 COLUMNS = {
@@ -259,13 +259,8 @@ COLUMNS = {
 
 def peer_versions() -> dict[str, str]:
     """Return the versions of the peers' packages that are installed."""
-    versions = {}
-    for package in ("newton", "warp-lang", "ipctk"):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
+    installed = {package.name: package.version for package in importlib.metadata.distributions()}
+    return {name: installed[name] for name in ("newton", "warp-lang", "ipctk") if name in installed}
 
 
 def main() -> None:
@@ -277,17 +272,15 @@ def main() -> None:
     if chosen.smoke:
         chosen.scenes, chosen.frames = ["tshirt_1k"], 8
         efforts, strictly, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
-        "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores,
+        "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores(),
         "date": time.strftime("%Y-%m-%d"), **environment(),
         "scenes": kept(chosen.out / "peers.json").get("scenes", {}),
     }  # fmt: skip
     result["versions"] |= peer_versions()
     for name in chosen.scenes:
         scene = example_scene(*name.split("_"), CLIP, chosen.frames)
-        rows = measure_scene(scene, efforts, strictly, settings, blender, EVERY)
-        result["scenes"][name] = rows
+        result["scenes"][name] = rows = measure_scene(scene, efforts, strictly, settings, blender)
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
         keep(chosen.out / "peers.json", result)
         percent = [
