@@ -35,7 +35,7 @@ from blender_cloth import blender_python, run_blender
 from harness import cores, keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
-from eslr_jax import SimConfig, Trajectory, score_trajectory
+from eslr_jax import SimConfig, score_trajectory
 from eslr_jax.errors import MissingExtraError, NonFiniteError
 from eslr_jax.pipeline.assets.budget import device_name
 from eslr_jax.pipeline.report.calibrate import example_scene
