@@ -129,12 +129,9 @@ def observe(
     """Return what the network is told of positions at t, of the step since t - 1 [m] and of contacts."""
     garment = space.garment
     # Rows of vectors are turned back by a product from the right.
-    arrows = (
-        contacts.next_points - contacts.points,
-        contacts.normals,
-        contacts.next_normals - contacts.normals,
-    )
-    x, moved, body, normals, turned = (rows @ turn for rows in (position, step, *arrows))
+    drift, swing = contacts.next_points - contacts.points, contacts.next_normals - contacts.normals
+    arrows = (position, step, drift, contacts.normals, swing)
+    x, moved, body, normals, turned = (rows @ turn for rows in arrows)
     is_real = garment.vertex_mask[:, None]
     now, before = (face_frames(y, garment) @ space.inverse_frames for y in (x, x - moved))
     distance = jnp.clip(contacts.distances, -CONTACT_RADIUS, CONTACT_RADIUS)[:, None]
@@ -151,8 +148,7 @@ def predict(network: Weights, seen: Seen) -> Change:
     """Return the change of a frame."""
     assert network.space is not None
     scaled = standardise(seen, network.seen_mean, network.seen_deviation)
-    mask = (network.space.garment.rest_areas > 0).astype(jnp.float32)
-    change = Transformer().apply(network.params, scaled, network.space.geodesic, mask)
+    change = Transformer().apply(network.params, scaled, network.space.geodesic, network.space.face_mask)
     return jax.tree.map(
         lambda x, mean, deviation: mean + deviation * x, change, network.change_mean, network.change_deviation
     )
@@ -168,9 +164,8 @@ def loss(network: Weights, seen: Seen, change: Change, key: Array) -> Float[Arra
     assert network.space is not None
     keys = jax.random.split(key)
     noisy = Seen(*(x + _NOISE * jax.random.normal(k, x.shape) for x, k in zip(seen, keys, strict=True)))
-    mask = (network.space.garment.rest_areas > 0).astype(jnp.float32)
-    found = Transformer().apply(network.params, noisy, network.space.geodesic, mask)
-    assert isinstance(found, Change)
+    mask = network.space.face_mask
+    found: Any = Transformer().apply(network.params, noisy, network.space.geodesic, mask)
     of_faces = jnp.mean(jnp.abs(found.faces - change.faces), axis=0, where=mask[:, None] > 0)
     return jnp.mean(of_faces) + jnp.mean(jnp.abs(found.whole - change.whole))
 
@@ -200,14 +195,10 @@ def train(truth: Truth, steps: int, seed: int = 0) -> tuple[Weights, dict[str, A
         for positions, worn in zip(truth.positions, truth.worn, strict=True)
     ]
     seen, change = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
-    is_face = np.asarray(space.garment.rest_areas) > 0
-    moments = [column_moments(values, is_face) for values in (seen, change)]
-    seen, change = (
-        jax.tree.map(lambda x, m, d: (x - m) / d, values, *moment)
-        for values, moment in zip((seen, change), moments, strict=True)
-    )
+    moments = [column_moments(values, np.asarray(space.face_mask) > 0) for values in (seen, change)]
+    seen, change = standardise(seen, *moments[0]), standardise(change, *moments[1])
     first = jax.tree.map(lambda x: x[0], seen)
-    params = Transformer().init(jax.random.key(seed), first, space.geodesic, is_face.astype(np.float32))
+    params = Transformer().init(jax.random.key(seed), first, space.geodesic, space.face_mask)
     network = Weights(params, *moments[0], *moments[1], space)
     draw = np.random.default_rng(seed)
 

@@ -33,6 +33,11 @@ class Space:
     laplacian: Float[Array, "vertices vertices"]
     smooth_inverse: Float[Array, "vertices vertices"]  # of the step off the body, were no vertex inside
 
+    @property
+    def face_mask(self) -> Float[Array, " faces"]:
+        """One for real faces, zero for padding."""
+        return (self.garment.rest_areas > 0).astype(jnp.float32)
+
 
 class Change(NamedTuple):
     """What a frame does to the cloth, in the garment's heading."""
@@ -65,14 +70,8 @@ def prepare_space(garment: Garment) -> Space:
     near = np.exp(-(corners @ away @ corners.T) / _GEODESIC_REACH)
     geodesic[np.ix_(is_face, is_face)] = near / near.sum(axis=1, keepdims=True)
     smooth = _SMOOTH * laplacian.T @ laplacian + _STAY * np.eye(len(positions))
-    tables = (
-        np.linalg.inv(frames),
-        cotangents,
-        geodesic,
-        np.linalg.pinv(laplacian, hermitian=True),
-        laplacian,
-        np.linalg.inv(smooth),
-    )
+    poisson = np.linalg.pinv(laplacian, hermitian=True)
+    tables = (np.linalg.inv(frames), cotangents, geodesic, poisson, laplacian, np.linalg.inv(smooth))
     return Space(garment, *(jnp.asarray(table, jnp.float32) for table in tables))
 
 

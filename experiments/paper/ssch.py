@@ -14,7 +14,6 @@ Source: Santesteban et al. 2021 (SSCH), whose loss weights were not published; o
 from __future__ import annotations
 
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -139,8 +138,7 @@ def unpose(
 
 def _encode(params: Any, scaled: Float[Array, "shapes vertices 3"]) -> tuple[Array, Array]:
     """Return mean and logarithmic variance of latents, both of shape [shapes, 25]."""
-    found = Encoder().apply(params, scaled.reshape((len(scaled), -1)))
-    assert isinstance(found, tuple)
+    found: Any = Encoder().apply(params, scaled.reshape((len(scaled), -1)))
     return found
 
 
@@ -154,8 +152,7 @@ def standardise(
 def decode(network: Ssch, latents: Float[Array, "*batch latents"]) -> Float[Array, "*batch vertices 3"]:
     """Return offsets of the rest mesh [m]."""
     shape = network.offset_mean.shape
-    scaled = Decoder(shape[0] * 3).apply(network.params["decoder"], latents)
-    assert isinstance(scaled, jax.Array)
+    scaled: Any = Decoder(shape[0] * 3).apply(network.params["decoder"], latents)
     scaled = scaled.reshape((*latents.shape[:-1], *shape))
     return jnp.broadcast_to(network.offset_mean, scaled.shape) + scaled * jnp.broadcast_to(
         network.offset_deviation, scaled.shape
@@ -167,36 +164,40 @@ def displace(
 ) -> Float[Array, "frames vertices 3"]:
     """Return the garment's positions on a moving body [m]; padded vertices stay in place."""
     features = motion_features(transforms, network)
-    latents = Regressor().apply(network.params["regressor"], features[None])
-    assert isinstance(latents, jax.Array)
-    offsets = decode(network, latents[0])
-    missing = garment.rest_positions.shape[0] - offsets.shape[1]
-    return carry(garment, jnp.pad(offsets, ((0, 0), (0, missing), (0, 0))), transforms)
-
-
-@struct.dataclass
-class RestScene:
-    """The garment and the body at rest, on which shapes are judged."""
-
-    garment: Garment
-    surface: BodySurface
-    body: Float[Array, "surface_vertices 3"]  # [m]
+    latents: Any = Regressor().apply(network.params["regressor"], features[None])
+    return carry(garment, decode(network, latents[0]), transforms)
 
 
 def shape_loss(
-    params: Any, network: Ssch, offsets: Float[Array, "shapes vertices 3"], rest: RestScene, key: Array
+    params: Any,
+    network: Ssch,
+    offsets: Float[Array, "shapes vertices 3"],
+    garment: Garment,
+    surface: BodySurface,
+    key: Array,
 ) -> Float[Array, ""]:
-    """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm]."""
+    """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm].
+
+    Depth is that in the body at rest.
+    """
+    body = jnp.asarray(load_body().rest_positions)[surface.vertex_ids]
+
+    def depth_of(offsets: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
+        """Return by how much the clearance is missed [m]."""
+        position = garment.rest_positions + offsets
+        found = find_contacts(position, body, body, surface, garment.vertex_blocks)
+        return penetration(position, jax.lax.stop_gradient(found), _CLEARANCE)
+
     network = network.replace(params=params)
     scaled = standardise(offsets, network)
     mean, spread = _encode(params["encoder"], scaled)
     keys = jax.random.split(key)
     decoded = decode(network, mean + jnp.exp(0.5 * spread) * jax.random.normal(keys[0], mean.shape))
     drawn = decode(network, jax.random.normal(keys[1], (_COLLIDING, _LATENTS)))
-    depth = jax.lax.map(partial(_depth, rest), jnp.concatenate([decoded[:_COLLIDING], drawn]))
+    depth = jax.lax.map(depth_of, jnp.concatenate([decoded[:_COLLIDING], drawn]))
     error = decoded - offsets
     divergence = 0.5 * jnp.mean(jnp.sum(jnp.exp(spread) + mean**2 - 1.0 - spread, axis=1))
-    bumps = _bumps(error, rest.garment)
+    bumps = _bumps(error, garment)
     return 100.0 * (jnp.mean(jnp.abs(error)) + jnp.mean(jnp.abs(bumps)) + jnp.mean(depth)) + (
         _DIVERGENCE * divergence
     )
@@ -209,15 +210,6 @@ def _bumps(x: Float[Array, "shapes vertices 3"], garment: Garment) -> Float[Arra
     return x - around / jnp.maximum(jnp.sum(mask, axis=2, dtype=x.dtype), 1.0)
 
 
-def _depth(rest: RestScene, offsets: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
-    """Return by how much the clearance from the body at rest is missed [m]."""
-    position = rest.garment.rest_positions + offsets
-    found = jax.lax.stop_gradient(
-        find_contacts(position, rest.body, rest.body, rest.surface, rest.garment.vertex_blocks)
-    )
-    return penetration(position, found, _CLEARANCE)
-
-
 def motion_loss(
     params: Any,
     network: Ssch,
@@ -226,8 +218,7 @@ def motion_loss(
     latents: Float[Array, "sequences frames latents"],
 ) -> Float[Array, ""]:
     """Return the regressor's loss: errors of the decoded cloth [cm] and of the latents."""
-    found = Regressor().apply(params, features)
-    assert isinstance(found, jax.Array)
+    found: Any = Regressor().apply(params, features)
     error = decode(network, found) - offsets
     return 100.0 * jnp.mean(jnp.abs(error)) + _MATCH * jnp.mean(jnp.abs(found - latents))
 
@@ -260,11 +251,8 @@ def prepare(
 def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, dict[str, Any]]:
     """Train auto-encoder and regressor on a garment's rollouts; return the network and how it was trained."""
     began = time.process_time()
-    garment, body = load_garment(truth.worn[0].garment), load_body()
-    scene_body = truth.worn[0].scene.body
-    assert scene_body is not None
-    surface = scene_body.surface
-    rest = RestScene(garment, surface, jnp.asarray(body.rest_positions)[surface.vertex_ids])
+    garment, body = load_garment(truth.worn[0].garment), truth.worn[0].scene.body
+    assert body is not None
     count = garment.rest_positions.shape[0]
     transforms = jnp.stack([worn.poses.joint_transforms for worn in truth.worn])
     positions = jnp.asarray(truth.positions[:, :, :count])
@@ -276,7 +264,9 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
 
     parts = {name: network.params[name] for name in ("encoder", "decoder")}
     parts, shape_losses = fit(
-        jax.value_and_grad(lambda params, batch, key: shape_loss(params, network, batch, rest, key)),
+        jax.value_and_grad(
+            lambda params, batch, key: shape_loss(params, network, batch, garment, body.surface, key)
+        ),
         parts,
         lambda _: flat[draw.integers(len(flat), size=_SHAPES)],
         steps[0],
