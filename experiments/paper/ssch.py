@@ -253,6 +253,7 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
     began = time.process_time()
     garment, body = load_garment(truth.worn[0].garment), truth.worn[0].scene.body
     assert body is not None
+    rest = garment, body.surface
     count = garment.rest_positions.shape[0]
     transforms = jnp.stack([worn.poses.joint_transforms for worn in truth.worn])
     positions = jnp.asarray(truth.positions[:, :, :count])
