@@ -15,14 +15,13 @@ import jax
 import jax.numpy as jnp
 from harness import keep, kept, machine, parser
 
-from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scenes
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.assets import split_clips
 from eslr_jax.pipeline.assets.budget import device_name
 from eslr_jax.pipeline.assets.garments import Resolution
 from eslr_jax.pipeline.report.scene_parts import time_in_turns
 from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
-from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.terms import FAST
 
 CONFIG = SimConfig(iterations=20)

@@ -35,14 +35,13 @@ from blender_cloth import blender_python, run_blender
 from harness import cores, keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
-from eslr_jax import SimConfig, score_trajectory
-from eslr_jax.errors import MissingExtraError, NonFiniteError
+from eslr_jax import MissingExtraError, NonFiniteError, SimConfig, rollout_scene, score_trajectory
 from eslr_jax.pipeline.assets.budget import device_name
 from eslr_jax.pipeline.report.calibrate import example_scene
 from eslr_jax.pipeline.report.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
-from eslr_jax.simulation.rollout import rollout_scene, step_frame
+from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.terms import Contact
 from eslr_jax.terms.contact import starting_rows

@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from harness import parser, put
 
-from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, simulate
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scenes, simulate
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.assets import load_splits
 from eslr_jax.pipeline.cli.console import use_compile_cache
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.simulation.scene import Integrator, start_integrator
 from eslr_jax.types import Scene
 

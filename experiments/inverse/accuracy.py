@@ -20,10 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from harness import keep, machine, parser
 
-from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body
+from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body, rollout_scene
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.scene import build_scene
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.solve import Start, solve

@@ -16,11 +16,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from harness import keep, parser, save
 
-from eslr_jax.config import SimConfig
+from eslr_jax import Material, SimConfig, rollout_scene
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.report.report import environment
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Material, Scene
+from eslr_jax.types import Scene
 from inverse.search import Search, descend, gradient_cost, search_simplex
 from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 

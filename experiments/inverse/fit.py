@@ -14,13 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from harness import keep, parser
 
-from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene
+from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene, rollout_scene
 from eslr_jax.mesh.rest_shape import with_rest_positions
 from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.motion import still_motion
 from eslr_jax.pose.retarget import ARM_ABDUCTION
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import FAST
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Body, Scene

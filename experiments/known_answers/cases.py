@@ -14,16 +14,15 @@ from hard_cases.build import icosphere, make_cloth, make_scene, plane, sheet
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
-from eslr_jax.config import SimConfig
+from eslr_jax import Material, SimConfig, Trajectory, rollout_scene
 from eslr_jax.fabric.materials import COTTON, Weave, stretch_stiffness
 from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.pipeline.fabrics import Described, on_threads
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import Air, Term
 from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 from eslr_jax.terms.stretch import stretch_energy
-from eslr_jax.types import Garment, Material, Scene, Trajectory
+from eslr_jax.types import Garment, Scene
 from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
 from known_answers.strip import LENGTH, kept_in, strip
 

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.config import SimConfig
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.simulation.scene import Integrator
 from known_answers.strip import strip
 

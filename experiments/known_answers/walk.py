@@ -8,9 +8,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene, rollout_scene
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.terms import FAST
 

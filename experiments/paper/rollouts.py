@@ -12,8 +12,7 @@ import harness
 import jax
 import numpy as np
 
-from eslr_jax.config import SimConfig
-from eslr_jax.networks.network import Network
+from eslr_jax import Network, SimConfig, Trajectory, rollout_scene
 from eslr_jax.pipeline.assets.budget import SOLVER
 from eslr_jax.pipeline.assets.models import model_record
 from eslr_jax.pipeline.report.calibrate import simulator_of
@@ -28,9 +27,8 @@ from eslr_jax.pipeline.report.gap import OptimalityGap, stepped_potentials, traj
 from eslr_jax.pipeline.report.metrics import extremes, measure_frames
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.simulation.batch import simulate_scenes
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.hood import HoodParameters
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Scene
 from paper import mat, posed, ssch
 from paper.hood_metrics import hood_metrics
 from paper.mat_space import prepare_space

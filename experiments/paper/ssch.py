@@ -24,8 +24,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from eslr_jax import load_body, load_garment
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.pipeline.assets import load_body, load_garment
 from eslr_jax.pose import lbs
 from eslr_jax.terms.collision import penetration
 from eslr_jax.types import BodySurface, Garment
@@ -265,9 +265,7 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
 
     parts = {name: network.params[name] for name in ("encoder", "decoder")}
     parts, shape_losses = fit(
-        jax.value_and_grad(
-            lambda params, batch, key: shape_loss(params, network, batch, garment, body.surface, key)
-        ),
+        jax.value_and_grad(lambda params, batch, key: shape_loss(params, network, batch, *rest, key)),
         parts,
         lambda _: flat[draw.integers(len(flat), size=_SHAPES)],
         steps[0],

@@ -17,10 +17,9 @@ import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.files.npz import read_arrays, write_arrays
 from eslr_jax.pipeline.assets import split_clips
-from eslr_jax.simulation.rollout import rollout_scene
 from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 _FRAMES = 100  # of a clip, as in the tables
