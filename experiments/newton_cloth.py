@@ -152,15 +152,8 @@ def bending_cotangents(cloth: Cloth) -> Float[np.ndarray, "hinges 4"]:
         return np.sum(a * b, axis=1) / np.linalg.norm(np.cross(a, b), axis=1)
 
     start, end, left, right = cloth.hinges.T
-    return np.stack(
-        [
-            cotangent(start, end, left),
-            cotangent(start, end, right),
-            cotangent(end, start, left),
-            cotangent(end, start, right),
-        ],
-        axis=1,
-    )
+    pairs = ((start, end), (end, start))
+    return np.stack([cotangent(*pair, tip) for pair in pairs for tip in (left, right)], axis=1)
 
 
 def contact_stiffness(scene: Scene) -> float:
@@ -174,11 +167,7 @@ def contact_stiffness(scene: Scene) -> float:
 
 
 def require_newton() -> ModuleType:
-    """Return Newton.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
+    """Return Newton, or raise MissingExtraError."""
     return require("newton", extra="peers", purpose="the comparison with other simulators")
 
 
@@ -213,17 +202,14 @@ class NewtonCloth:
         self._body = None
         if scene.body is not None:
             self._body, self._mesh = np.asarray(scene.body.positions), model.shape_source[0].mesh
-            for bound, size in (
-                (model.shape_collision_aabb_lower, -_FAR),
-                (model.shape_collision_aabb_upper, _FAR),
-            ):
-                bound.fill_(self._warp.vec3(size, size, size))
+            model.shape_collision_aabb_lower.fill_(self._warp.vec3(-_FAR, -_FAR, -_FAR))
+            model.shape_collision_aabb_upper.fill_(self._warp.vec3(_FAR, _FAR, _FAR))
         gap = max(_REACH / self.substeps, _LEAST_GAP)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=gap)
         self._contacts = self._pipeline.contacts()
         self._now, self._after = model.state(), model.state()
-        # The first substep loads kernels and sizes buffers, the second is recorded: replayed without Python in
-        # between, frames of 1k vertices take half the time.
+        # The first substep loads kernels and sizes buffers, the second is recorded: replaying it without Python
+        # halves the time of frames of 1k vertices.
         self._substep()
         with self._warp.ScopedCapture() as capture:
             self._substep()
@@ -272,9 +258,8 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     radius = float(contact_thickness(scene.garment, scene.term(Collision).thickness))
     count = len(cloth.rest)
     flags = np.where(cloth.masses > 0, int(newton.ParticleFlags.ACTIVE), 0).tolist()
-    builder.add_particles(
-        cloth.rest.tolist(), [(0.0, 0.0, 0.0)] * count, cloth.masses.tolist(), [radius] * count, flags
-    )
+    still = [(0.0, 0.0, 0.0)] * count
+    builder.add_particles(cloth.rest.tolist(), still, cloth.masses.tolist(), [radius] * count, flags)
     start, end, left, right = cloth.hinges.T
     length = np.linalg.norm(cloth.rest[end] - cloth.rest[start], axis=1)
     stretch, triangles, hinges = strip_stiffness(cloth.shear, cloth.area_stiffness), None, None
@@ -304,10 +289,8 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     if solver == "vbd":
         builder.color(include_bending=True)
     if scene.body is not None:
-        friction = float(scene.term(Friction).coefficient)
-        config = newton.ModelBuilder.ShapeConfig(
-            density=0.0, ke=contact_stiffness(scene), kd=0.0, mu=friction
-        )
+        contact = {"ke": contact_stiffness(scene), "kd": 0.0, "mu": float(scene.term(Friction).coefficient)}
+        config = newton.ModelBuilder.ShapeConfig(density=0.0, **contact)
         faces = np.asarray(scene.body.surface.faces).ravel()
         mesh = newton.Mesh(np.asarray(scene.body.positions[0]), faces, compute_inertia=False)
         builder.add_shape_mesh(-1, mesh=mesh, cfg=config)
