@@ -42,9 +42,8 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
     for batch, times in time_in_turns(calls, turns).items():
         milliseconds = min(times) / frames
         rows.append({"batch": batch, "frame_ms": milliseconds, "frame_and_scene_ms": milliseconds / batch})
-        print(
-            f"{vertices}, {batch} scenes: {milliseconds:.2f} ms a frame, {milliseconds / batch:.3f} a scene"
-        )
+        text = f"{milliseconds:.2f} ms a frame, {milliseconds / batch:.3f} a scene"
+        print(f"{vertices}, {batch} scenes: {text}")
     return rows
 
 

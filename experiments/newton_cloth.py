@@ -1,9 +1,8 @@
 """A scene of this package in Newton's cloth solvers: VBD, Style3D and XPBD (extra `peers`).
 
-Newton is Apache-2.0, https://github.com/newton-physics/newton; read in version 1.8.0. The body is one static
-mesh whose points and velocities are set, and whose search tree is refitted, before every substep. Cloth meets it
-by vertices, at the distance that our vertices keep. There is no damping. With self-contact, VBD keeps our
-distance between layers, Style3D its own, and XPBD none between vertices and faces.
+Newton is Apache-2.0, https://github.com/newton-physics/newton; read in version 1.8.0. The body is one static mesh
+that is moved and refitted before every substep. Cloth meets it by vertices, at the distance that ours keep. There
+is no damping. With self-contact, VBD keeps our distance between layers, Style3D its own, XPBD none.
 
 How fabric is carried over (h thickness, mu and lambda Lame, l edge, A the areas of the faces beside it):
 
@@ -16,8 +15,8 @@ How fabric is carried over (h thickness, mu and lambda Lame, l edge, A the areas
   where the constraint is soft.
 
 What can't be carried over: the cubic contact energy becomes a spring, as stiff as ours is on average over the
-contact distance (XPBD: rigid), and XPBD takes no friction speed. Every substep is a step of implicit Euler of its
-own, so with several of them even an exact answer is not the minimum of our potential, which has one step a frame.
+contact distance (XPBD: rigid), and XPBD takes no friction speed. With several substeps even an exact answer is
+not the minimum of our potential, which has one step a frame.
 """
 
 from __future__ import annotations

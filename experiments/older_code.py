@@ -3,13 +3,10 @@
     python experiments/older_code.py --commit COMMIT             # 1k, 4k, 10k: half an hour
     python experiments/older_code.py --commit HEAD --smoke --out DIR
 
-Each code solves the frames of its own near-optimal rollouts of T-shirt, dress and trousers. The iterations that
-count are those after which the median gap is a given share of the initial gap. The cost of a frame and of an
-iteration is timed on the T-shirt. Contacts and fabrics changed too, so the two codes do not solve quite the same
-problem. The older code must have the names that the scripts below use: it is 0.2.0 or later. The kept result
-is of an older one, made before.
-
-Writes older_code.json.
+Each code solves the frames of its own near-optimal rollouts of T-shirt, dress and trousers, and counts iterations
+until the median gap is a share of the initial gap. Frames and iterations are timed on the T-shirt. Contacts and
+fabrics changed too, so the two codes do not solve quite the same problem. The older code must have the names that
+the scripts below use: it is 0.2.0 or later. The kept result is of an older one. Writes older_code.json.
 """
 
 from __future__ import annotations

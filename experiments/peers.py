@@ -5,13 +5,11 @@
     python experiments/peers.py --smoke --out DIR
 
 The methods are timed alternately, frame by frame, so that whatever disturbs the machine disturbs all of them.
-Times are medians over frames, after kernels are compiled and first frames are run. `frame_cpu_ms` is CPU time:
-Newton uses one core, and ours uses all that it gets, so give the process one core to compare them
-(`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The gap is
-teacher-forced: every frame starts from a state of our near-optimal rollout, and its gap in our potential is
-relative to the initial gap. A method with substeps solves a finer problem; the row of our own solver with
-substeps shows the gap that substeps alone cause. The gap on its own rollout is that of the frames that a method
-simulated.
+Times are medians over frames. `frame_cpu_ms` is CPU time: Newton uses one core, and ours uses all that it gets,
+so give the process one core to compare them (`taskset -c 0` on Linux). Stretch, penetration and intersections are
+those of the free rollout. The gap is relative to the initial gap, of frames from states of our near-optimal
+rollout, and of the frames that a method simulated itself. A method with substeps solves a finer problem; the row
+of our own solver with substeps shows the gap that they alone cause.
 
 Blender can only run through from a start at rest: it comes after the others, and has no teacher-forced gap.
 Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a Python with `bpy`
@@ -112,27 +110,25 @@ def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
     return [Method(s.name, cloth.substeps, s.iterations, cloth) for s, cloth in cloths]
 
 
-def take_turns(
-    methods: list[Method], scene: Scene, num_frames: int
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+def take_turns(methods: list[Method], scene: Scene, num_frames: int) -> tuple[list[np.ndarray], np.ndarray]:
     """Roll all methods out, frame by frame in turns, to a number of frames with the start.
 
     Returns:
-        Per method positions [m], shape [frames, vertices, 3]; and wall and processor time per frame [ms].
+        Per method positions [m], shape [frames, vertices, 3]; wall and processor time [ms], shape [2, methods,
+        frames - 1].
     """
     for method in methods:  # compiles
         jax.block_until_ready(method.step(scene.initial_state, 0))
     states = [scene.initial_state] * len(methods)
     positions = [[np.asarray(scene.initial_state.position)] for _ in methods]
-    wall, processor = [[] for _ in methods], [[] for _ in methods]
+    times = np.empty((2, len(methods), num_frames - 1))
     for frame in range(num_frames - 1):
         for k, method in enumerate(methods):
-            began, began_processor = time.perf_counter(), time.process_time()
+            began = time.perf_counter(), time.process_time()
             states[k] = jax.block_until_ready(method.step(states[k], frame))
-            wall[k].append(1e3 * (time.perf_counter() - began))
-            processor[k].append(1e3 * (time.process_time() - began_processor))
+            times[:, k, frame] = time.perf_counter() - began[0], time.process_time() - began[1]
             positions[k].append(np.asarray(states[k].position))
-    return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
+    return [np.stack(rows) for rows in positions], 1e3 * times
 
 
 def teach(methods: list[Method], scene: Scene) -> tuple[list[np.ndarray], np.ndarray]:
@@ -162,21 +158,14 @@ def describe_rollout(positions: np.ndarray, scene: Scene, every: int = EVERY) ->
     return {"finite": True, **{column: score[name] for name, column in SCORE.items()}}
 
 
-def measure_scene(
-    scene: Scene,
-    efforts: tuple[tuple[int, int], ...],
-    strictly: tuple[tuple[int, int], ...],
-    settings: tuple[Setting, ...],
-    blender: tuple[tuple[int, int], ...],
-) -> list[dict[str, Any]]:
+def measure_scene(scene: Scene, is_smoke: bool) -> list[dict[str, Any]]:
     """Return a row of plain values per method and effort: ours, with strict contact, Newton's, Blender's."""
-    methods = [our_method(scene, *effort) for effort in efforts]
-    if scene.body is not None:
-        rows = starting_rows(scene.garment.vertex_mask.shape[0])
-        strict = scene.replace(terms=(*scene.terms, Contact(rows=rows)))
-        methods += [our_method(strict, *effort, "ours, strict") for effort in strictly]
-    methods += newton_methods(scene, settings)
-    positions, wall, processor = take_turns(methods, scene, scene.num_frames)
+    methods = [our_method(scene, *effort) for effort in (OURS[-1:] if is_smoke else OURS)]
+    rows = starting_rows(scene.garment.vertex_mask.shape[0])
+    strict = scene.replace(terms=(*scene.terms, Contact(rows=rows)))
+    methods += [our_method(strict, *effort, "ours, strict") for effort in (() if is_smoke else OUR_STRICT)]
+    methods += newton_methods(scene, SMOKE_SETTINGS if is_smoke else SETTINGS)
+    positions, (wall, processor) = take_turns(methods, scene, scene.num_frames)
     gap, initial = teach(methods, scene)
     rows = [
         {
@@ -189,7 +178,7 @@ def measure_scene(
         }
         for k, method in enumerate(methods)
     ]
-    return rows + blender_rows(scene, blender)
+    return rows + blender_rows(scene, BLENDER[:1] if is_smoke else BLENDER)
 
 
 def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
@@ -224,7 +213,7 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
     if not methods[0]:
         return {}
     methods += [newton_methods(scene, settings) for scene in scenes[1:]]
-    _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
+    _, (wall, _) = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
     for scene, of_scene in zip(scenes, methods, strict=True):
         gap, initial = teach(of_scene, scene)
         relative.append([np.maximum(values, 0.0) / initial for values in gap])
@@ -267,10 +256,8 @@ def main() -> None:
     options.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
     options.add_argument("--frames", type=int, default=40)
     chosen = options.parse_args()
-    efforts, strictly, settings, blender = OURS, OUR_STRICT, SETTINGS, BLENDER
     if chosen.smoke:
         chosen.scenes, chosen.frames = ["tshirt_1k"], 8
-        efforts, strictly, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
     result: dict[str, Any] = {
         "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores(),
         "date": time.strftime("%Y-%m-%d"), **environment(),
@@ -279,7 +266,7 @@ def main() -> None:
     result["versions"] |= peer_versions()
     for name in chosen.scenes:
         scene = example_scene(*name.split("_"), CLIP, chosen.frames)
-        result["scenes"][name] = rows = measure_scene(scene, efforts, strictly, settings, blender)
+        result["scenes"][name] = rows = measure_scene(scene, chosen.smoke)
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
         keep(chosen.out / "peers.json", result)
         percent = [

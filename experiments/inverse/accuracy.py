@@ -3,10 +3,9 @@
     python experiments/inverse accuracy [--smoke] [--out DIR]
 
 The loss is the garment's mean height, the parameters are stretch stiffness, bending stiffness, density and a lift
-of the body, in float32. They are compared with central differences in float64. A crumpled sheet has many minima
-beside each other, so float64 starts each frame where float32 came to rest, and goes on to where float64 ends. How
-far that is, is in the result. The cost is the processor time of loss and gradient over that of the loss alone,
-timed in turns. Writes accuracy.json.
+of the body. Float32 is compared with central differences in float64. A crumpled sheet has many minima beside each
+other, so float64 starts each frame where float32 came to rest; how far it goes from there is in the result. The
+cost is the processor time of loss and gradient over that of the loss alone, in turns. Writes accuracy.json.
 """
 
 from __future__ import annotations

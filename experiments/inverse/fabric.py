@@ -2,10 +2,9 @@
 
     python experiments/inverse fabric [--smoke] [--out DIR]
 
-The sheet hangs from two corners, one of which a hand moves. Weight and inertia grow with the density, so motion
-in the air shows only stiffness over density. A washer of known mass on a free corner does not grow with it and
-tells the three apart. "Measured" is a simulation with the true fabric, without noise. Writes fabric.json and
-fabric.png.
+The sheet hangs from two corners, one of which a hand moves. Motion in the air shows only stiffness over density;
+a washer of known mass on a free corner tells the three apart. "Measured" is a simulation with the true fabric,
+without noise. Writes fabric.json and fabric.png.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
     python experiments/known_answers [--smoke] [--out DIR] [--part answers rotations peers drape order walk]
 
-Answers: free fall, terminal velocity, energy of a swing, a hanging strip, rigidity of a cantilever and of a
-cylinder, a twisted sheet, a buckled one, a slope, a ball; with both integrators where time matters. Rotations:
-strips that bend far, and a plane that turns. Peers: four answers by Newton's solvers (extra `peers`) and
-Blender's cloth (BLENDER_PYTHON, see peers.py), where they are installed. Drape: Cusick's coefficient of the named
-fabrics. Order: of the integrators, without folds. Walk: millimetres by tolerance, timestep and mesh.
-Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png and
-known_drapes.png.
+Answers: those of `cases.py`, with both integrators where time matters. Rotations: strips that bend far, and a
+plane that turns. Peers: four answers by Newton's solvers (extra `peers`) and Blender's cloth (BLENDER_PYTHON, see
+peers.py), where they are installed. Drape: Cusick's coefficient of the named fabrics. Order: of the integrators,
+without folds. Walk: millimetres by tolerance, timestep and mesh. Writes known_answers.json, part by part, and
+with matplotlib (extra `plot`) known_answers.png, known_rotations.png and known_drapes.png.
 """
 
 from __future__ import annotations

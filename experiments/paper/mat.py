@@ -5,11 +5,10 @@
 It keeps faces as tokens with the published features of two frames, one token for the whole, heads that average
 along geodesics, the change of every face's frame as output, the Poisson solve that joins faces, and the
 least-squares step off the body; supervised, one frame at a time, with noise on its inputs. It lacks seven eighths
-of the width (64 instead of 512), half the layers, half of every feed-forward part (it is twice as wide as a token
-instead of four times), the root of the width by which encoded inputs are scaled, attention by softmax (linear
-attention takes a tenth of the time), the turn of the nearest body face about its normal, and singular values; the
-Laplacian of the step off the body is the rest mesh's. All it sees is turned to the garment's own heading. It is
-trained on one garment.
+of the width, half the layers and of the feed-forward parts' width, the scale of encoded inputs, attention by
+softmax (linear attention takes a tenth of the time), the turn of the nearest body face about its normal, and
+singular values; the Laplacian of the step off the body is the rest mesh's. All it sees is turned to the garment's
+heading.
 
 Source: Li et al. 2024 (MAT), whose published run names no flags; weights of losses are ours.
 """

@@ -4,15 +4,12 @@
         [--models LABEL=NAME,NAME ...] [--controls] [--anew] [--clips NAME ...] [--frames 100] [--smoke]
 
 native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
-seen, with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a
-Mixamo character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them.
-model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks;
-and the Total of Table I where that was measured at the same size.
+seen, with other modes of the geodesic embedding. new_motion (IV): every third clip of DeepMimic, where the paper
+takes a Mixamo character. model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also
+of the full-size networks; and the Total of Table I where that was measured at the same size.
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
-bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the
-gap, from the optimum's states and from its own, and the energies of free rollouts; a second row says it of the
-same network untrained.
+bundled network or an exported file, see `rollouts.read_system`. A second row is of the same network untrained.
 --controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
 
 A table is never written over one of another setting, nor a row that names its networks over one of others: give
