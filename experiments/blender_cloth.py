@@ -120,11 +120,7 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
 
 
 def blender_simulator(effort: tuple[int, int]) -> Simulator:
-    """Return Blender's cloth as a simulator of the hard cases, with an effort as for `run_blender`.
-
-    Raises:
-        MissingExtraError: BLENDER_PYTHON names no Python.
-    """
+    """Return Blender's cloth as a simulator of the hard cases, with an effort as for `run_blender`."""
     if blender_python() is None:
         raise MissingExtraError("BLENDER_PYTHON names no Python with bpy; see peers.py for how to install it")
 

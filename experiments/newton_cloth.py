@@ -174,11 +174,7 @@ class NewtonCloth:
     """A scene in one of Newton's solvers; steps frames from any state."""
 
     def __init__(self, scene: Scene, setting: Setting) -> None:
-        """Build the model.
-
-        Raises:
-            MissingExtraError: Newton is not installed.
-        """
+        """Build the model."""
         newton = require_newton()
         self._warp = require("warp", extra="peers", purpose="the comparison with other simulators")
         self._warp.config.log_level = self._warp.LOG_WARNING  # it would report every kernel it loads
@@ -320,11 +316,7 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
 
 
 def newton_simulator(setting: Setting) -> Simulator:
-    """Return a solver of Newton as a simulator of the hard cases.
-
-    Raises:
-        MissingExtraError: Newton is not installed.
-    """
+    """Return a solver of Newton as a simulator of the hard cases; MissingExtraError where it is not installed."""
     require_newton()
 
     def run(scene: Scene) -> Trajectory:

@@ -59,10 +59,7 @@ def in_turns(
     """Return what a program prints last, as JSON, in every turn of the code at every root.
 
     Its arguments are JSON in `sys.argv[1]`. Codes run alternately, in processes of their own, so that what else
-    runs on the machine disturbs them alike.
-
-    Raises:
-        subprocess.CalledProcessError: The program failed; its errors are on standard error.
+    runs on the machine disturbs them alike. Errors of a program are on standard error.
     """
     found: dict[str, list[Any]] = {name: [] for name in roots}
     command = [sys.executable, "-c", program, json.dumps(arguments)]

@@ -42,14 +42,10 @@ ROLLOUTS = (5, 10, 20, 50, 100), (0, 5, 20)  # iterations of free rollouts, by t
 
 
 def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> tuple[list[Cost], dict[str, list[dict]]]:
-    """Return what methods cost, and their points, from states of the optimum's own rollouts.
+    """Return what methods cost on the first scene, and their points, from states of the optimum's own rollouts.
 
     The optimum of a frame is the lowest potential that any method finds, since a network may lead to a deeper
-    minimum.
-
-    Args:
-        names: Of networks; SOLVER is the solver alone.
-        scenes: Of one size; the first is timed.
+    minimum. Scenes are of one size.
     """
     _, solver = simulator_of(SOLVER)
     truths = [rollout_scene(None, scene, solver, TRUTH_ITERATIONS) for scene in scenes]

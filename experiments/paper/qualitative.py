@@ -51,11 +51,9 @@ def face_energies(positions: Float[Array, "frames vertices 3"], scene: Scene) ->
 
 def at_vertices(energies: np.ndarray, scene: Scene) -> np.ndarray:
     """Return the mean over a vertex' faces, weighted by area."""
-    faces, areas = np.asarray(scene.garment.faces), np.asarray(scene.garment.rest_areas)
-    total, weight = np.zeros((2, len(scene.garment.rest_positions)))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], areas * energies)
-        np.add.at(weight, faces[:, corner], areas)
+    corners, areas = np.asarray(scene.garment.faces).ravel(), np.asarray(scene.garment.rest_areas)
+    count = len(scene.garment.rest_positions)
+    total, weight = (np.bincount(corners, x.repeat(3), count) for x in (areas * energies, areas))
     return total / np.maximum(weight, 1e-12)
 
 

@@ -59,12 +59,11 @@ class System(NamedTuple):
 def read_system(name: str) -> System:
     """Return the system of a name.
 
-    Args:
-        name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
-            NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
-            CHANGE is a control of `pipeline.report.evaluate` or another mode of the geodesic embedding.
-            SYSTEM@FOLDER is one of `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there.
-            Their control is `SKINNED`, the garment carried by the joints; mat's is "mat@FOLDER~untrained".
+    It is `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
+    NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it. CHANGE is a
+    control of `pipeline.report.evaluate` or another mode of the geodesic embedding. SYSTEM@FOLDER is one of
+    `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there. Their control is `SKINNED`, the
+    garment carried by the joints; mat's is "mat@FOLDER~untrained".
     """
     if name == SKINNED:
         return _replayed(lambda worn: skin_garment(worn.scene.garment, worn.poses.joint_transforms), {})
@@ -167,11 +166,7 @@ def roll(system: System, setting: Setting) -> list[tuple[Worn, Network | None, T
 
 
 def find_references(setting: Setting) -> list[Reference]:
-    """Return the near-optimal rollout of every scene, and the optima from its states.
-
-    Raises:
-        NonFiniteError: One of them is not finite.
-    """
+    """Return the near-optimal rollout of every scene, each checked to be finite, and the optima from its states."""
     system = read_system(OPTIMUM)
     found = []
     for worn, _, trajectory in roll(system, setting):

@@ -44,12 +44,7 @@ class Truth(NamedTuple):
 
 
 def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
-    """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`.
-
-    Raises:
-        ValueError: The folder holds rollouts of other clips or lengths.
-        NonFiniteError: A rollout is not finite.
-    """
+    """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`."""
     clips, frames = tuple(split_clips("train")), _FRAMES
     if is_smoke:
         clips, frames = clips[:1], 5

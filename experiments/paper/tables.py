@@ -204,9 +204,7 @@ def training_cost(names: Sequence[str]) -> dict[str, float]:
 def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
     """Return the parts of a table that was written before, row by row; empty ones where there is none.
 
-    Raises:
-        SystemExit: It is of other garments, clips, frames or vertices and may not be written over. Says which
-            differ, and what to give.
+    One of other garments, clips, frames or vertices may not be written over: SystemExit says which differ.
     """
     found = harness.kept(file)
     parts = {name: found.get(name, {}) for name in PARTS}
@@ -222,11 +220,7 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
 
 
 def check_networks(file: Path, rows: Rows, kept: dict[str, list[str]]) -> None:
-    """Refuse to take a row that the table has for one of other networks.
-
-    Raises:
-        SystemExit: Names the row and its networks.
-    """
+    """Refuse to take a row that the table has for one of other networks: SystemExit names both."""
     for label, names in rows.items():
         if label in kept and kept[label] != [short_name(name) for name in names]:
             own = ", ".join(kept[label])
@@ -248,11 +242,7 @@ def full_size(vertices: str, is_smoke: bool) -> tuple[str, ...]:
 
 
 def check_costs(file: Path, names: Sequence[str]) -> None:
-    """Refuse to write over a table with rows that would be lost: times compare only within a run.
-
-    Raises:
-        SystemExit: Names them.
-    """
+    """Refuse to write over a table with rows that would be lost, as times compare only within a run."""
     found = harness.kept(file).get("mean", {})
     if lost := [name for name in found if name not in names]:
         raise SystemExit(f"{file} has rows for {', '.join(lost)}; measure them too, or give another --out")
