@@ -131,7 +131,6 @@ def shoot(
 
 
 def figures(shot: Shot, indices: Sequence[int], **options: Any) -> list[np.ndarray]:
-    """Render frames of a scene."""
     cloth = shot.trajectory.positions, shot.scene.garment.faces
     mesh = map(np.asarray, (shot.poses.positions, shot.poses.faces, *cloth))
     colors = outfit_colors(list(shot.stored.outfit.values()))

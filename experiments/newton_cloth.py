@@ -174,7 +174,6 @@ class NewtonCloth:
     """A scene in one of Newton's solvers; steps frames from any state."""
 
     def __init__(self, scene: Scene, setting: Setting) -> None:
-        """Build the model."""
         newton = require_newton()
         self._warp = require("warp", extra="peers", purpose="the comparison with other simulators")
         self._warp.config.log_level = self._warp.LOG_WARNING  # it would report every kernel it loads

@@ -104,11 +104,16 @@ def renamed(
     weights = np.zeros((len(mesh.positions), len(names)))
     rows = np.arange(len(weights))[:, None]
     np.add.at(weights, (rows, owner[mesh.skin_indices]), mesh.skin_weights)
+    skeleton = Skeleton(names, parents, mesh.skeleton.rest_positions[first])
+    kept, chosen = strongest(weights)
+    return dataclasses.replace(mesh, skin_weights=kept, skin_indices=chosen, skeleton=skeleton)
+
+
+def strongest(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the four largest weights of every vertex, with sum one, and their joints."""
     chosen = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     kept = np.take_along_axis(weights, chosen, axis=1)
-    skeleton = Skeleton(names, parents, mesh.skeleton.rest_positions[first])
-    kept /= kept.sum(1, keepdims=True)
-    return dataclasses.replace(mesh, skin_weights=kept, skin_indices=chosen, skeleton=skeleton)
+    return kept / kept.sum(axis=1, keepdims=True), chosen
 
 
 def bundled_mesh(body: Body | None = None) -> RiggedMesh:
@@ -213,11 +218,9 @@ def figure() -> RiggedMesh:
     closeness = np.exp(-np.maximum(_capsule_distances(positions), 0.0) / 0.015)
     weights = np.zeros((len(positions), len(_FIGURE)))
     np.add.at(weights, (slice(None), [joint for joint, *_ in _CAPSULES]), closeness)
-    chosen = np.argsort(-weights, axis=1)[:, :4]
-    kept = np.take_along_axis(weights, chosen, axis=1)
     names, parents, places = zip(*_FIGURE, strict=True)
     skeleton = Skeleton(tuple(f"J_Bip_{name}" for name in names), parents, np.array(places, float))
-    return RiggedMesh("figure", positions, faces, kept / kept.sum(1, keepdims=True), chosen, skeleton)
+    return RiggedMesh("figure", positions, faces, *strongest(weights), skeleton)
 
 
 def _capsule_distances(points: np.ndarray) -> np.ndarray:

@@ -18,13 +18,12 @@ Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a P
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.metadata
 import os
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,19 +68,12 @@ TIMED_FRAMES = 20  # of `peer_points`
 Step = Callable[[ClothState, int], ClothState]  # from a state at a frame to the next
 
 
-@dataclasses.dataclass(frozen=True)
-class Method:
+class Method(NamedTuple):
     """A way to step one scene."""
 
     name: str
-    substeps: int
-    iterations: int  # per substep
+    effort: str  # substeps x iterations
     step: Step
-
-    @property
-    def effort(self) -> str:
-        """Substeps times iterations, as tables show them."""
-        return f"{self.substeps}x{self.iterations}"
 
 
 def our_method(scene: Scene, substeps: int, iterations: int, name: str = "ours") -> Method:
@@ -96,7 +88,7 @@ def our_method(scene: Scene, substeps: int, iterations: int, name: str = "ours")
     def run(state: ClothState, frame: int) -> ClothState:
         return advance(constant, state, jax.tree.map(lambda leaf: leaf[frame], inputs))
 
-    return Method(name, substeps, iterations, run)
+    return Method(name, f"{substeps}x{iterations}", run)
 
 
 def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
@@ -107,7 +99,7 @@ def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
         print(f"peers left out: {error}", file=sys.stderr)
         return []
     cloths = [(setting, NewtonCloth(scene, setting)) for setting in settings]
-    return [Method(s.name, cloth.substeps, s.iterations, cloth) for s, cloth in cloths]
+    return [Method(s.name, f"{cloth.substeps}x{s.iterations}", cloth) for s, cloth in cloths]
 
 
 def take_turns(methods: list[Method], scene: Scene, num_frames: int) -> tuple[list[np.ndarray], np.ndarray]:

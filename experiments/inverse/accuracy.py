@@ -60,7 +60,6 @@ def changed(scene: Scene, change: Change) -> Scene:
 
 
 def unchanged() -> Change:
-    """Return no change of any parameter."""
     return dict.fromkeys(STEPS, jnp.zeros(()))
 
 
@@ -98,7 +97,6 @@ def differences(scene: Scene, rests: np.ndarray, iterations: int) -> tuple[dict[
 
 
 def measure(garment: str, frames: tuple[int, ...], turns: int, iterations: int) -> dict[str, Any]:
-    """Return gradients, their errors and their cost."""
     scene = jax.tree.map(jnp.asarray, walk(garment, frames[-1]))
     value, slope = jax.jit(height), jax.jit(jax.value_and_grad(height, has_aux=True))
     found = {frame: slope(unchanged(), scene, frame) for frame in frames}
@@ -128,7 +126,6 @@ def measure(garment: str, frames: tuple[int, ...], turns: int, iterations: int) 
 
 
 def processor_time(function: Callable, arguments: tuple) -> float:
-    """Return the processor time that a call takes [s]."""
     began = time.process_time()
     jax.block_until_ready(function(*arguments))
     return time.process_time() - began

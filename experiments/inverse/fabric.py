@@ -107,7 +107,6 @@ def sensitivities(simulate) -> dict[str, float]:
 
 
 def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, scene: Scene) -> plt.Figure:
-    """Return the motion and the searches."""
     figure = plt.figure(figsize=(12, 5), layout="constrained")
     motion = figure.add_subplot(1, 2, 1, projection="3d")
     shades = plt.get_cmap("viridis")(np.linspace(0, 0.9, FRAMES))

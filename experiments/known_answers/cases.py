@@ -212,7 +212,6 @@ def sphere(simulator: Simulator) -> list[Answer]:
 
 
 def _simulate(simulator: Simulator, scene: Scene) -> Trajectory:
-    """Return what a simulator makes of a scene."""
     return simulator.simulate(simulator.prepare(scene))
 
 
@@ -251,7 +250,6 @@ def answer(is_smoke: bool) -> Iterator[Answer]:
 
 
 def peers() -> Iterator[Simulator]:
-    """Yield the simulators that are installed."""
     for setting in newton_cloth.BEST:
         effort = f" {setting.substeps}x{setting.iterations}" if setting.substeps else ""
         try:
@@ -266,7 +264,6 @@ def peers() -> Iterator[Simulator]:
 
 
 def compare(is_smoke: bool) -> Iterator[Answer]:
-    """Yield what other simulators find."""
     for simulator in peers():
         for case in FOR_PEERS[:1] if is_smoke else FOR_PEERS:
             yield from slope(simulator, _SLOPES) if case is slope else case(simulator)

@@ -38,7 +38,6 @@ class Drape(NamedTuple):
 
 
 def drapes(is_smoke: bool) -> Iterator[tuple[Drape, Hung]]:
-    """Yield how fabrics drape, each with a disc for the picture."""
     if is_smoke:
         yield drape("satin-woven", starts=1, spacing=0.03, frames=6)
         return

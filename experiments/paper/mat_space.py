@@ -53,14 +53,12 @@ def prepare_space(garment: Garment) -> Space:
     count, real = is_vertex.sum(), faces[is_face]
     frames = np.broadcast_to(np.eye(3), (len(faces), 3, 3)).copy()
     frames[is_face] = np.asarray(face_frames(garment.rest_positions, garment))[is_face]
-    cotangents = np.zeros((len(faces), 3))
+    cotangents, laplacian = np.zeros((len(faces), 3)), np.zeros((len(positions), len(positions)))
     for k in range(3):
-        tip = positions[real[:, (k + 2) % 3]]
-        a, b = positions[real[:, k]] - tip, positions[real[:, (k + 1) % 3]] - tip
-        cotangents[is_face, k] = 0.5 * np.sum(a * b, axis=1) / np.linalg.norm(np.cross(a, b), axis=1)
-    laplacian = np.zeros((len(positions), len(positions)))
-    for k in range(3):
-        i, j, w = real[:, k], real[:, (k + 1) % 3], cotangents[is_face, k]
+        i, j, tip = np.roll(real, -k, axis=1).T
+        a, b = positions[i] - positions[tip], positions[j] - positions[tip]
+        w = 0.5 * np.sum(a * b, axis=1) / np.linalg.norm(np.cross(a, b), axis=1)
+        cotangents[is_face, k] = w
         for row, column, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             np.add.at(laplacian, (row, column), sign * w)
     away = geodesic_distances(geodesic_graph(positions[:count], real), np.arange(count))

@@ -58,7 +58,6 @@ def at_vertices(energies: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
-    """Draw the share of faces that hold more than an energy per area."""
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(6.4, 3.6))

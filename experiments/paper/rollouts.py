@@ -166,7 +166,7 @@ def roll(system: System, setting: Setting) -> list[tuple[Worn, Network | None, T
 
 
 def find_references(setting: Setting) -> list[Reference]:
-    """Return the near-optimal rollout of every scene, each checked to be finite, and the optima from its states."""
+    """Return the near-optimal rollout of every scene, checked to be finite, and the optima from its states."""
     system = read_system(OPTIMUM)
     found = []
     for worn, _, trajectory in roll(system, setting):

@@ -183,7 +183,6 @@ def shape_loss(
     body = jnp.asarray(load_body().rest_positions)[surface.vertex_ids]
 
     def depth_of(offsets: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
-        """Return by how much the clearance is missed [m]."""
         position = garment.rest_positions + offsets
         found = find_contacts(position, body, body, surface, garment.vertex_blocks)
         return penetration(position, jax.lax.stop_gradient(found), _CLEARANCE)
