@@ -7,8 +7,6 @@ frame within 1 % of its optimum.
 Writes animation.webp.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from docs_pictures import figures, shoot
 from harness import parser

@@ -6,8 +6,6 @@ A T-shirt walks on the clips of the test split, as often as the largest batch as
 iterations. Writes batch_size.json with the milliseconds of a frame, and of a frame and scene.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import get_args
 

@@ -17,8 +17,6 @@ Fabric by part becomes one fabric, its mean. Lengths at rest are those of the me
 pinned garment has to start with its lengths at rest.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import subprocess

@@ -9,8 +9,6 @@ first ten frames, whose iterations come from the calibration alone.
 Writes budget_and_tolerance.json; a part that is not measured anew stays in it. Budgets need an idle machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ Writes PNG files of less than 150 kB. Figures of other experiments are copied fr
 picture of `eslr play` needs Chromium and the package playwright; without them it is left as it is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import tempfile

@@ -8,8 +8,6 @@ relative to one iteration of the solver, so that figures of a busy machine compa
 Writes frame_cost.json.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from typing import Any

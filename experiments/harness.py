@@ -1,7 +1,5 @@
 """What the scripts of this folder share: options, results in files, and tables."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -19,8 +19,6 @@ contact distance (XPBD: rigid), and XPBD takes no friction speed. With several s
 not the minimum of our potential, which has one step a frame.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

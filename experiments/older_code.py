@@ -9,8 +9,6 @@ fabrics changed too, so the two codes do not solve quite the same problem. The o
 the scripts below use: it is 0.2.0 or later. The kept result is of an older one. Writes older_code.json.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

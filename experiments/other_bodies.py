@@ -6,8 +6,6 @@ The bodies are synthetic, since no SMPL model and no bought character may ship: 
 proportions and on other rigs, in T-poses, and a figure of capsules with a surface of its own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 import warnings

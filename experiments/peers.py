@@ -16,8 +16,6 @@ Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a P
 (`python3.11 -m venv blender && blender/bin/pip install bpy`). What is missing is left out. Writes peers.json.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import sys

@@ -13,8 +13,6 @@ follow for a few numbers of iterations. `peers.py` says what the peers are and h
 Writes speed_vs_error.json and .png after every size.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

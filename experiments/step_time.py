@@ -9,8 +9,6 @@ of its own on one core; without PyTorch it is left out.
 Writes step_time.json.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import json

@@ -9,8 +9,6 @@ program was compiled during the measurement.
 Rows of timestep.json stay until they are measured again.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any

@@ -6,8 +6,6 @@ The whole step also poses the body, searches contacts, states the problem, advan
 metrics. The bare step is given a problem of the same size. They take turns. Writes train_throughput.json.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import optax

@@ -8,8 +8,6 @@ other, so float64 starts each frame where float32 came to rest; how far it goes 
 cost is the processor time of loss and gradient over that of the loss alone, in turns. Writes accuracy.json.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

@@ -7,8 +7,6 @@ a washer of known mass on a free corner tells the three apart. "Measured" is a s
 without noise. Writes fabric.json and fabric.png.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt

@@ -7,8 +7,6 @@ sleeves) is let out along its normals. The loss is the stretch on the body above
 frames in which the cloth comes to rest, and a small price for letting out. Writes fit.json.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

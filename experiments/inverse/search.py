@@ -1,7 +1,5 @@
 """Search by gradients beside search without, at equal cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ which begins with the last state of the first, nothing is pinned. Gradients pass
 is empty: the target is a point. Writes throw.json.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

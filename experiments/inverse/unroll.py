@@ -9,8 +9,6 @@ The network simulates a swinging sheet alone, from its own states. Three losses,
 Judged on a longer motion that none has seen. Writes unroll.json.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

@@ -9,8 +9,6 @@ without folds. Walk: millimetres by tolerance, timestep and mesh. Writes known_a
 with matplotlib (extra `plot`) known_answers.png, known_rotations.png and known_drapes.png.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator

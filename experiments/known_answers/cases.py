@@ -1,7 +1,5 @@
 """The known answers: each case returns what was found beside what is known."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial

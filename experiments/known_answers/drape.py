@@ -1,7 +1,5 @@
 """Cusick's drape coefficient of named fabrics, in the median of starts that differ by rounding, and by mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 The strip swings without folds, in frames that are solved to rounding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ Bisshopp and Drucker 1945, doi 10.1090/qam/13360 (a load at the end); Love 1927,
 Theory of Elasticity, section 263 (a column).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import jax

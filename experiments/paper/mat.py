@@ -13,8 +13,6 @@ heading.
 Source: Li et al. 2024 (MAT), whose published run names no flags; weights of losses are ours.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from functools import partial

@@ -1,7 +1,5 @@
 """What MAT computes on a garment's rest mesh: faces to their changes and back, and the step off the body."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

@@ -17,8 +17,6 @@ All read rotations relative to the root instead of SMPL's axis-angles, and no bo
 Source: Bertiche et al. 2021 (PBNS); Santesteban et al. 2022 (SNUG); Chen et al. 2024 (GAPS).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from functools import partial

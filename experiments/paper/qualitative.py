@@ -7,8 +7,6 @@ ARCSim. A name is one of `rollouts.read_system`. Writes qualitative.png (cloth),
 area on cloth, one scale for all), stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import harness

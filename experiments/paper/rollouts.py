@@ -1,7 +1,5 @@
 """Systems by name, and free rollouts measured by HOOD's six terms and their Total, as in the paper's tables."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path

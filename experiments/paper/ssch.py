@@ -11,8 +11,6 @@ half to three quarters of the width. The body at rest is its mesh, not a learned
 Source: Santesteban et al. 2021 (SSCH), whose loss weights were not published; ours are.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What trained systems share: the loop, and the supervised ones' ground truth, rollouts of the training clips."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -17,8 +17,6 @@ another --out or label. A row that a table has is kept, and not measured again. 
 with the versions and the device that made it, so that several runs can fill a table.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

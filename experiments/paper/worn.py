@@ -1,7 +1,5 @@
 """Garments on clips: what the tables measure on, and what supervised systems learn from."""
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 
