@@ -35,10 +35,7 @@ from eslr_jax.terms import FAST, Contact, scene_terms
 from eslr_jax.types import Scene
 
 SIZES = ("1k", "4k", "10k", "50k", "200k")
-CASES = {
-    "fast contact": FAST,
-    "strict contact": scene_terms(),
-}
+CASES = {"fast contact": FAST, "strict contact": scene_terms()}
 RATIO = "whole frame with strict contact / with fast"
 CLIP = "cmu_016_32"
 FRAMES = 12  # simulated before the one that is timed

@@ -241,7 +241,6 @@ GARMENTS = (
 CLIP, FRAMES = "cmu_016_32", 100  # a walk, and frames of it
 STILL, RAISE = 50, 25  # frames that the body stands, and in which it lifts its arms to its own rest pose
 STANDING = 45.0  # [degrees] of the arms below the horizontal, as garments are cut
-SMOKE_FRAMES = STILL  # of the walk
 CONFIG = SimConfig(iterations=30)
 
 
@@ -315,7 +314,7 @@ def main() -> None:
         rows, pictures = [], []
         dressed = {"rest_positions": np.asarray(body.rest_positions), "rig": body, "follows": False}
         for row, (moving, positions, faces) in measure(
-            body, garments, frames=SMOKE_FRAMES if chosen.smoke else FRAMES
+            body, garments, frames=STILL if chosen.smoke else FRAMES
         ):
             print(name, row, flush=True)
             rows.append(row)

@@ -89,7 +89,7 @@ def draw(result: dict, path: Path) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    sizes, peers = list(result["sizes"]), result["peers"]
+    sizes = list(result["sizes"])
     names = dict.fromkeys(name for size in sizes for name in result["sizes"][size]["methods"])
     colors = {name: "#1b1b1b" if name == SOLVER else f"C{k % 10}" for k, name in enumerate(names)}
     lines = {}
@@ -99,7 +99,7 @@ def draw(result: dict, path: Path) -> None:
     for axis, size in zip(axes[0], sizes, strict=True):
         for name, entries in result["sizes"][size]["methods"].items():
             shown = [entry for entry in entries if entry["gap_relative_median"] > 1e-6]
-            label = "L-BFGS" if name == SOLVER else name if name in peers else f"{name} + L-BFGS"
+            label = "L-BFGS" if name == SOLVER else name if name in result["peers"] else f"{name} + L-BFGS"
             times, errors = ([entry[key] for entry in shown] for key in ("frame_ms", "gap_relative_median"))
             (lines[label],) = axis.loglog(times, errors, "o-", color=colors[name], markersize=4)
             look = {"fontsize": 7, "textcoords": "offset points", "xytext": (3, 3)}

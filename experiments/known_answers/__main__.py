@@ -11,7 +11,6 @@ with matplotlib (extra `plot`) known_answers.png, known_rotations.png and known_
 
 import importlib
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,6 @@ PARTS = {  # each with the module and function that yields its rows
     "answers": ("cases", "answer"), "rotations": ("rotations", "turned"), "peers": ("cases", "compare"),
     "drape": ("drape", "drapes"), "order": ("refinement", "orders"), "walk": ("refinement", "refine"),
 }  # fmt: skip
-
-
-def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
-    """Yield a part's rows, each with its drape for the picture or None."""
-    module, name = PARTS[part]
-    for found in getattr(importlib.import_module(f"known_answers.{module}"), name)(is_smoke):
-        row = found[0] if part == "drape" else found
-        yield getattr(row, "as_dict", row._asdict)(), found if part == "drape" else None
 
 
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
@@ -125,9 +116,13 @@ def main() -> None:
     drapes: list = []
     for part in arguments.part:
         rows = []
-        for row, drawn in measure(part, arguments.smoke):
+        module, name = PARTS[part]
+        for found in getattr(importlib.import_module(f"known_answers.{module}"), name)(arguments.smoke):
+            if part == "drape":
+                drapes.append(found)
+            answer = found[0] if part == "drape" else found
+            row = getattr(answer, "as_dict", answer._asdict)()
             rows.append(row)
-            drapes += [] if drawn is None else [drawn]
             result = {**result, part: rows, **environment()}
             harness.keep(path, result)
             told = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}

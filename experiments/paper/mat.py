@@ -67,7 +67,7 @@ class Weights:
     seen_deviation: Seen
     change_mean: Change
     change_deviation: Change
-    space: Space | None = None
+    space: Any = None  # a `Space`, where the network is applied
 
 
 class Transformer(nn.Module):
@@ -107,7 +107,6 @@ class Mat(System):
 
     def apply(self, params: Weights, problem: FrameProblem, state: ClothState, /) -> Any:
         """Return positions at t + 1 [m]."""
-        assert params.space is not None
         contacts = problem.data_of(Collision).nearest
         turn = heading(state.position, params.space)
         step = problem.timestep * state.velocity
@@ -143,7 +142,6 @@ def observe(
 
 def predict(network: Weights, seen: Seen) -> Change:
     """Return the change of a frame."""
-    assert network.space is not None
     scaled = standardise(seen, network.seen_mean, network.seen_deviation)
     change = Transformer().apply(network.params, scaled, network.space.geodesic, network.space.face_mask)
     return jax.tree.map(
@@ -158,7 +156,6 @@ def standardise(values: Any, mean: Any, deviation: Any) -> Any:
 
 def loss(network: Weights, seen: Seen, change: Change, key: Array) -> Float[Array, ""]:
     """Return the mean error of a frame in standard deviations; both arguments are standardised."""
-    assert network.space is not None
     keys = jax.random.split(key)
     noisy = Seen(*(x + _NOISE * jax.random.normal(k, x.shape) for x, k in zip(seen, keys, strict=True)))
     mask = network.space.face_mask

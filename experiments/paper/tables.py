@@ -262,23 +262,18 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
     for label, system in systems.items():
-        scene = prepare_scene(
-            load_garment("tshirt", vertices=vertices, **system.garment_options),
-            poses,
-            terms=FAST,
-        )  # type: ignore[arg-type]
+        garment = load_garment("tshirt", vertices=vertices, **system.garment_options)  # type: ignore[arg-type]
+        scene = prepare_scene(garment, poses, terms=FAST)
         inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
         def forward(network, state, config=system.config, scene=scene, inputs=inputs):
             return make_stepper(network, config)(frame_problem(scene, state, inputs), state)[0].position
 
-        memory = jax.jit(forward).lower(system.network, scene.initial_state).compile().memory_analysis()
-        assert memory is not None
-        parts[label] = (forward, (system.network, scene.initial_state))
-        found[label] = {
-            **system.cost,
-            "memory_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
-        }
+        arguments = system.network, scene.initial_state
+        memory: Any = jax.jit(forward).lower(*arguments).compile().memory_analysis()
+        parts[label] = (forward, arguments)
+        size = memory.temp_size_in_bytes + memory.argument_size_in_bytes
+        found[label] = {**system.cost, "memory_mb": size / 1e6}
         if system.network is not None:
             config = system.network.config
             layers = next(getattr(config, name) for name in _LAYERS if hasattr(config, name))
