@@ -3,8 +3,7 @@
     python experiments/animation.py [--smoke] [--out DIR]
 
 Each garment is put on over the rest pose and simulated by the solver with BDF2, faces kept off the skin, every
-frame within 1 % of its optimum.
-Writes animation.webp.
+frame within 1 % of its optimum. Writes animation.webp.
 """
 
 import numpy as np

@@ -4,9 +4,7 @@
 
 T-shirt and dress on three clips against BDF2 at 1/960 s, by both integrators with one to eight steps a frame. All
 begin with the same settled cloth. The cost is CPU time, which other jobs do not change much; it is null where the
-program was compiled during the measurement.
-
-Rows of timestep.json stay until they are measured again.
+program was compiled meanwhile. Rows of timestep.json stay until they are measured again.
 """
 
 import time

@@ -58,17 +58,16 @@ def main() -> None:
         changed = scene.replace(material=fabric(logs, scene))
         return rollout_scene(None, changed, SimConfig(iterations=iterations)).positions
 
-    def loss(logs: jax.Array, measured: jax.Array) -> jax.Array:
+    def loss(logs: jax.Array) -> jax.Array:
         return jnp.mean(jnp.sum((simulate(logs) - measured) ** 2, axis=-1)) * 1e6  # [mm^2]
 
     measured = simulate(jnp.zeros(3))
     value, value_and_grad = jax.jit(loss), jax.jit(jax.value_and_grad(loss))
-    functions = tuple(lambda logs, f=f: f(logs, measured) for f in (value, value_and_grad))
-    cost = gradient_cost(*functions, np.log(STARTS[0]), turns)
+    cost = gradient_cost(value, value_and_grad, np.log(STARTS[0]), turns)
     runs = []
     for start in np.log(STARTS[:1] if options.smoke else STARTS):
-        by_gradient = descend(functions[1], start, steps)
-        runs.append((by_gradient, search_simplex(functions[0], start, round(cost * steps))))
+        by_gradient = descend(value_and_grad, start, steps)
+        runs.append((by_gradient, search_simplex(value, start, round(cost * steps))))
     result = {
         "what": NAMES, "starts": STARTS, "gradient_in_evaluations": round(cost, 2),
         "lbfgs": [report(run, cost) for run, _ in runs],

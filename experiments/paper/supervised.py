@@ -59,7 +59,6 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
             found.append(np.asarray(trajectory.positions))
             print(f"truth {len(found)} of {len(clips)} {time.process_time() - began:.0f} s", flush=True)
         hours = (time.process_time() - began) / 3600
-        folder.mkdir(parents=True, exist_ok=True)
         arrays = {"positions": np.stack(found), "clips": np.array(clips), "core_hours": np.array(hours)}
         write_arrays(path, arrays)
     kept = read_arrays(path, content="ground truth")
@@ -70,7 +69,6 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
 
 def write_archive(path: Path, arrays: dict[str, Any], record: dict[str, Any]) -> None:
     """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(arrays).items()}
     write_arrays(path, leaves, is_compressed=True)
     path.with_suffix(".json").write_text(json.dumps(record, indent=1))
