@@ -85,10 +85,7 @@ class Cloth:
 
 
 def strip_stiffness(shear: np.ndarray, area_stiffness: np.ndarray) -> np.ndarray:
-    """Return the tension per width and strain of a strip pulled along one axis, free across it [N/m].
-
-    E h = 4 mu (mu + lambda) h / (2 mu + lambda), of plane stress.
-    """
+    """Return E h of plane stress [N/m], the tension per width and strain of a strip that is free across."""
     return 4.0 * shear * (shear + area_stiffness) / (2.0 * shear + area_stiffness)
 
 

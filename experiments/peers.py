@@ -148,6 +148,14 @@ def describe_rollout(positions: np.ndarray, scene: Scene, every: int = EVERY) ->
     return {"finite": True, **{column: score[name] for name, column in SCORE.items()}}
 
 
+def row_of(
+    method: str, effort: str, wall: np.ndarray, processor: np.ndarray, positions: np.ndarray, scene: Scene
+) -> dict[str, Any]:
+    """Return a method's row of a table."""
+    times = {"frame_ms": float(np.median(wall)), "frame_cpu_ms": float(np.median(processor))}
+    return {"method": method, "effort": effort, **times, **describe_rollout(positions, scene)}
+
+
 def measure_scene(scene: Scene, is_smoke: bool) -> list[dict[str, Any]]:
     """Return a row of plain values per method and effort: ours, with strict contact, Newton's, Blender's."""
     methods = [our_method(scene, *effort) for effort in (OURS[-1:] if is_smoke else OURS)]
@@ -158,14 +166,8 @@ def measure_scene(scene: Scene, is_smoke: bool) -> list[dict[str, Any]]:
     positions, (wall, processor) = take_turns(methods, scene, scene.num_frames)
     gap, initial = teach(methods, scene)
     rows = [
-        {
-            "method": method.name,
-            "effort": method.effort,
-            "frame_ms": float(np.median(wall[k])),
-            "frame_cpu_ms": float(np.median(processor[k])),
-            **describe_rollout(positions[k], scene),
-            **summarize_gap(gap[k], initial),
-        }
+        row_of(method.name, method.effort, wall[k], processor[k], positions[k], scene)
+        | summarize_gap(gap[k], initial)
         for k, method in enumerate(methods)
     ]
     return rows + blender_rows(scene, BLENDER[:1] if is_smoke else BLENDER)
@@ -176,16 +178,10 @@ def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...]) -> list[dic
     if blender_python() is None:
         print("Blender left out: BLENDER_PYTHON names no Python with bpy", file=sys.stderr)
         return []
-    runs = [run_blender(scene, effort) for effort in efforts]
+    runs = {"{}x{}".format(*effort): run_blender(scene, effort) for effort in efforts}
     return [
-        {
-            "method": f"Blender {run.version}",
-            "effort": f"{steps}x{rounds}",
-            "frame_ms": float(np.median(run.wall)),
-            "frame_cpu_ms": float(np.median(run.processor)),
-            **describe_rollout(run.positions, scene),
-        }
-        for (steps, rounds), run in zip(efforts, runs, strict=True)
+        row_of(f"Blender {run.version}", effort, run.wall, run.processor, run.positions, scene)
+        for effort, run in runs.items()
     ]
 
 

@@ -9,7 +9,6 @@ of the width, half the layers and of the feed-forward parts' width, the scale of
 softmax (linear attention takes a tenth of the time), the turn of the nearest body face about its normal, and
 singular values; the Laplacian of the step off the body is the rest mesh's. All it sees is turned to the garment's
 heading.
-
 Source: Li et al. 2024 (MAT), whose published run names no flags; weights of losses are ours.
 """
 
@@ -251,6 +250,4 @@ def main() -> None:
     chosen = options(__doc__, 2000).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, 2 if chosen.smoke else chosen.steps, chosen.seed)
-    path = chosen.out / f"mat_{chosen.garment}.npz"
-    write_network(network, path, training)
-    print(path, training)
+    write_network(network, chosen.out / f"mat_{chosen.garment}.npz", training)

@@ -13,7 +13,6 @@ They predict displacements of the rest mesh, which the skin weights then carry a
   2023), of which neither code nor text was found.
 
 All read rotations relative to the root instead of SMPL's axis-angles, and no body shape.
-
 Source: Bertiche et al. 2021 (PBNS); Santesteban et al. 2022 (SNUG); Chen et al. 2024 (GAPS).
 """
 
@@ -269,6 +268,4 @@ def main() -> None:
         "core_hours": (time.process_time() - began) / 3600,
         "final_loss_j": float(np.mean(losses[-100:])) * _UNIT,
     }
-    path = chosen.out / f"{chosen.system}_{chosen.garment}.npz"
-    write_network(network, path, training)
-    print(path, training)
+    write_network(network, chosen.out / f"{chosen.system}_{chosen.garment}.npz", training)

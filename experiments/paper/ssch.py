@@ -7,7 +7,6 @@ off the body at rest, and GRUs that turn the body's motion into latents; supervi
 the solver's. It lacks the diffused body model (the garment's own skin weights hold, and simulated cloth is
 unposed vertex by vertex), the body's shape, the learned pose code (ten principal components stand for it) and
 half to three quarters of the width. The body at rest is its mesh, not a learned distance.
-
 Source: Santesteban et al. 2021 (SSCH), whose loss weights were not published; ours are.
 """
 
@@ -314,6 +313,4 @@ def main() -> None:
     chosen = options(__doc__, (2000, 400), nargs=2, metavar=("SHAPE", "MOTION")).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, (2, 2) if chosen.smoke else tuple(chosen.steps), chosen.seed)
-    path = chosen.out / f"ssch_{chosen.garment}.npz"
-    write_network(network, path, training)
-    print(path, training)
+    write_network(network, chosen.out / f"ssch_{chosen.garment}.npz", training)

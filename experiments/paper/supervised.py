@@ -68,10 +68,11 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
 
 
 def write_archive(path: Path, arrays: dict[str, Any], record: dict[str, Any]) -> None:
-    """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON."""
+    """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON; say so."""
     leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(arrays).items()}
     write_arrays(path, leaves, is_compressed=True)
     path.with_suffix(".json").write_text(json.dumps(record, indent=1))
+    print(path, record["training"])
 
 
 def read_archive(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
