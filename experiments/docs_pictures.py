@@ -118,11 +118,8 @@ def shoot(
     poses = pose_body(body, load_motion(_CLIP), num_frames=frames)
     stored = wear_together([load_garment_file(name, vertices=vertices) for name in garments], garments)
     cloth = prepare_stored(stored, name="+".join(garments))
-    terms = scene_terms(*others)
-    moving = with_settling(poses, SETTLE_FRAMES, body)
-    scene = prepare_scene(
-        cloth, moving, material=garment_material(fabric, cloth, stored), terms=terms, integrator="bdf2"
-    )
+    made = {"material": garment_material(fabric, cloth, stored), "terms": scene_terms(*others)}
+    scene = prepare_scene(cloth, with_settling(poses, SETTLE_FRAMES, body), integrator="bdf2", **made)
     run = simulate(None, scene, config=_CONFIG)
     trajectory, scene = last_frames(run.trajectory, run.scene, frames)
     return Shot(stored, body, poses, scene, trajectory)

@@ -233,8 +233,6 @@ def _capsule_distances(points: np.ndarray) -> np.ndarray:
 
 
 BODIES = {make.__name__: make for make in (smpl_male, smpl_female, child, mixamo, figure)}
-
-
 GARMENTS = (
     "tshirt", "tank", "longsleeve", "shortsleeve", "dress", "tightdress", "shorts", "kneepants", "pants",
 )  # fmt: skip

@@ -110,11 +110,10 @@ def _read_trained(kind: str, folder: str) -> System:
         return reader.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")[0]
 
     if kind != "mat":
-
-        def positions(worn: Worn) -> Any:
-            return reader.displace(weights_of(worn), worn.scene.garment, worn.poses.joint_transforms)
-
-        return _replayed(positions, cost)
+        return _replayed(
+            lambda worn: reader.displace(weights_of(worn), worn.scene.garment, worn.poses.joint_transforms),
+            cost,
+        )
 
     def stepper_of(worn: Worn) -> Network:
         weights = weights_of(worn)
