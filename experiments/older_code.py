@@ -79,9 +79,7 @@ def compare(roots: Mapping[str, Path], size: str, is_smoke: bool) -> dict[str, A
         falling = -np.log(np.minimum.accumulate(gaps[name][0]))
         needed = {f"{share:.1%}": float(np.interp(-np.log(share), falling, COUNTS)) for share in SHARES}
         # The least of all turns: what else runs on the machine only ever adds.
-        times = {
-            share: min(fixed + n * iteration for fixed, iteration in costs) for share, n in needed.items()
-        }
+        times = {share: min(fixed + n * each for fixed, each in costs) for share, n in needed.items()}
         by_turn = [{"fixed_ms": fixed, "iteration_ms": iteration} for fixed, iteration in costs]
         row[name] = {"iterations": needed, "ms": times, "turns": by_turn}
     row["ratio"] = {share: ms / row["before"]["ms"][share] for share, ms in row["now"]["ms"].items()}

@@ -56,9 +56,8 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> tuple[list[C
             best = ends._replace(optimum=optimum)
             for count, energy in (ends.solver if cost.name == SOLVER else ends.refined).items():
                 shares.setdefault(count, []).append(np.asarray(best.share(energy)))
-        points[cost.name] = [
-            peers.point(count, cost.frame_ms(count), np.concatenate(parts)) for count, parts in shares.items()
-        ]
+        rows = shares.items()
+        points[cost.name] = [peers.point(n, cost.frame_ms(n), np.concatenate(parts)) for n, parts in rows]
     return costs, points
 
 

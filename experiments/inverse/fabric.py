@@ -98,9 +98,7 @@ def sensitivities(simulate) -> dict[str, float]:
     moves = [(simulate(0.1 * axis) - simulate(-0.1 * axis)).ravel() / 0.2 * 1e3 for axis in jnp.eye(3)]
     singular = np.linalg.svd(np.stack(moves), compute_uv=False)
     scale = np.sqrt(len(moves[0]) / 3)
-    return {
-        name: float(size / scale) for name, size in zip(("most", "middle", "least"), singular, strict=True)
-    }
+    return dict(zip(("most", "middle", "least"), (singular / scale).tolist(), strict=True))
 
 
 def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, scene: Scene) -> plt.Figure:

@@ -128,6 +128,6 @@ def main() -> None:
         }
         for name, values in joined.items()
     }
-    sizes = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
-    result = {**sizes, "mean": rows, "environment": environment()}
+    result = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
+    result |= {"mean": rows, "environment": environment()}
     harness.keep(chosen.out / "stretch_energy.json", result)

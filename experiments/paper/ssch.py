@@ -151,9 +151,9 @@ def decode(network: Ssch, latents: Float[Array, "*batch latents"]) -> Float[Arra
     shape = network.offset_mean.shape
     scaled: Any = Decoder(shape[0] * 3).apply(network.params["decoder"], latents)
     scaled = scaled.reshape((*latents.shape[:-1], *shape))
-    return jnp.broadcast_to(network.offset_mean, scaled.shape) + scaled * jnp.broadcast_to(
-        network.offset_deviation, scaled.shape
-    )
+    scales = network.offset_mean, network.offset_deviation
+    mean, deviation = (jnp.broadcast_to(x, scaled.shape) for x in scales)
+    return mean + scaled * deviation
 
 
 def displace(
