@@ -22,7 +22,7 @@ _FINEST = 400  # iterations that stand for none left to do
 _SECONDS = 0.4  # of the swing
 _FRAME = 0.1  # [s]
 _PARTS = (2, 4, 8, 16)  # of it, each of which is a step
-_FINEST = 64
+_FINEST_PARTS = 64
 _TURN = 0.5  # [rad/s], about the upper end; faster, the pull outwards would make it ring
 
 
@@ -101,7 +101,7 @@ def orders(is_smoke: bool) -> Iterator[Order]:
     """Yield the error at each timestep, against BDF2 in the finest one."""
     hanging = strip("euler", frames=61, is_pinned=True, timestep=0.1, tilt=0.0)
     rest = rollout_scene(None, hanging, SimConfig(iterations=100)).positions[-1]
-    best = _end(rest, "bdf2", 8 if is_smoke else _FINEST)
+    best = _end(rest, "bdf2", 8 if is_smoke else _FINEST_PARTS)
     for integrator in ("euler", "bdf2"):
         before = None
         for parts in _PARTS[:1] if is_smoke else _PARTS:
