@@ -99,7 +99,7 @@ def measure_size(size: str, turns: int, training: bool) -> dict:
         "builds": {},
     }
     args, builds, times = (network, graph, garment), builds_of(network.config), {}
-    kinds = {"forward": (builds, args, turns)}
+    kinds: dict[str, tuple] = {"forward": (builds, args, turns)}
     if training:
         steps = {name: training_step(build) for name, build in builds.items()}
         kinds["train"] = (steps, (*args, OPTIMIZER.init(network.params)), max(3, turns // 2))
