@@ -169,15 +169,14 @@ def shape_loss(
     params: Any,
     network: Ssch,
     offsets: Float[Array, "shapes vertices 3"],
-    garment: Garment,
-    surface: BodySurface,
+    rest: tuple[Garment, BodySurface, Float[Array, "surface_vertices 3"]],
     key: Array,
 ) -> Float[Array, ""]:
     """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm].
 
-    Depth is that in the body at rest.
+    Shapes are judged at rest: `rest` has the garment, and the body's surface and places [m].
     """
-    body = jnp.asarray(load_body().rest_positions)[surface.vertex_ids]
+    garment, surface, body = rest
 
     def depth_of(offsets: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
         position = garment.rest_positions + offsets
@@ -249,7 +248,7 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
     began = time.process_time()
     garment, body = load_garment(truth.worn[0].garment), truth.worn[0].scene.body
     assert body is not None
-    rest = garment, body.surface
+    rest = garment, body.surface, jnp.asarray(load_body().rest_positions)[body.surface.vertex_ids]
     count = garment.rest_positions.shape[0]
     transforms = jnp.stack([worn.poses.joint_transforms for worn in truth.worn])
     positions = jnp.asarray(truth.positions[:, :, :count])
@@ -261,7 +260,7 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
 
     parts = {name: network.params[name] for name in ("encoder", "decoder")}
     parts, shape_losses = fit(
-        jax.value_and_grad(lambda params, batch, key: shape_loss(params, network, batch, *rest, key)),
+        jax.value_and_grad(lambda params, batch, key: shape_loss(params, network, batch, rest, key)),
         parts,
         lambda _: flat[draw.integers(len(flat), size=_SHAPES)],
         steps[0],
