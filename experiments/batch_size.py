@@ -6,8 +6,6 @@ A T-shirt walks on the clips of the test split, as often as the largest batch as
 iterations. Writes batch_size.json with the milliseconds of a frame, and of a frame and scene.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import get_args
 
@@ -15,14 +13,13 @@ import jax
 import jax.numpy as jnp
 from harness import keep, kept, machine, parser
 
-from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scenes
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.assets import split_clips
 from eslr_jax.pipeline.assets.budget import device_name
 from eslr_jax.pipeline.assets.garments import Resolution
 from eslr_jax.pipeline.report.scene_parts import time_in_turns
 from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
-from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.terms import FAST
 
 CONFIG = SimConfig(iterations=20)
@@ -43,9 +40,8 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
     for batch, times in time_in_turns(calls, turns).items():
         milliseconds = min(times) / frames
         rows.append({"batch": batch, "frame_ms": milliseconds, "frame_and_scene_ms": milliseconds / batch})
-        print(
-            f"{vertices}, {batch} scenes: {milliseconds:.2f} ms a frame, {milliseconds / batch:.3f} a scene"
-        )
+        text = f"{milliseconds:.2f} ms a frame, {milliseconds / batch:.3f} a scene"
+        print(f"{vertices}, {batch} scenes: {text}")
     return rows
 
 

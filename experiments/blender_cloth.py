@@ -17,8 +17,6 @@ Fabric by part becomes one fabric, its mean. Lengths at rest are those of the me
 pinned garment has to start with its lengths at rest.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import subprocess
@@ -37,7 +35,7 @@ from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Scene
 
 # Steps per frame, rounds of collision per step: in peers.json the least gap on its own rollout.
 BEST = (45, 2)
@@ -120,15 +118,10 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
 
 
 def blender_simulator(effort: tuple[int, int]) -> Simulator:
-    """Return Blender's cloth as a simulator of the hard cases, with an effort as for `run_blender`.
-
-    Raises:
-        MissingExtraError: BLENDER_PYTHON names no Python.
-    """
+    """Return Blender's cloth as a simulator of the hard cases, with an effort as for `run_blender`."""
     if blender_python() is None:
         raise MissingExtraError("BLENDER_PYTHON names no Python with bpy; see peers.py for how to install it")
-
-    def run(scene: Scene) -> Trajectory:
-        return foreign_trajectory(run_blender(scene, effort).positions, scene)
-
-    return Simulator(f"Blender, {effort[0]}x{effort[1]}", run)
+    return Simulator(
+        f"Blender, {effort[0]}x{effort[1]}",
+        lambda scene: foreign_trajectory(run_blender(scene, effort).positions, scene),
+    )

@@ -16,7 +16,6 @@ import numpy as np
 
 
 def add_mesh(name, positions, faces):
-    """Return a new mesh object in the scene."""
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(positions.tolist(), [], faces.tolist())
     thing = bpy.data.objects.new(name, mesh)
@@ -60,7 +59,6 @@ def add_cloth(scene, folder):
 
 
 def add_body(scene, folder):
-    """Add the body that cloth collides with."""
     thing = add_mesh("body", scene["body_start"], scene["body_faces"])
     animate(thing, folder / "body.pc2")
     thing.modifiers.new("collision", "COLLISION")

@@ -9,8 +9,6 @@ first ten frames, whose iterations come from the calibration alone.
 Writes budget_and_tolerance.json; a part that is not measured anew stays in it. Budgets need an idle machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from harness import kept, machine, parser, put
 from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene, simulate
 from eslr_jax.config import MOST_ITERATIONS
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.pipeline.assets import split_clips
 from eslr_jax.pipeline.assets.budget import Calibration, first_iterations, keep_budget, read_calibration
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.simulation.plan import prepare_scenes
@@ -37,13 +35,13 @@ BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration
 EVERY = 2  # frames between those whose gap is measured
 
 
-def measure_tolerance(scenes: Sequence[Scene], tolerance: float, every: int) -> dict[str, Any]:
-    """Return how many of every so many frames keep a relative gap; scenes are of one resolution."""
+def measure_tolerance(scenes: Sequence[Scene], tolerance: float) -> dict[str, Any]:
+    """Return how many of the frames keep a relative gap; scenes are of one resolution."""
     config = SimConfig(iterations=MOST_ITERATIONS, tolerance=tolerance)
     shares, spent = [], []
     for scene in scenes:
         trajectory = rollout_scene(None, scene, config)
-        gap = trajectory_gap(trajectory, scene, every=every)
+        gap = trajectory_gap(trajectory, scene, every=EVERY)
         shares.append(np.asarray(gap.share(gap.reached)))
         spent.append(float(np.mean(trajectory.iterations[1:])))
     joined = np.concatenate(shares)
@@ -81,10 +79,9 @@ def main() -> None:
         "--calibration", type=Path, help="calibration to choose by; by default that of `eslr simulate`"
     )
     chosen = options.parse_args()
-    garments, clips, frames, every = GARMENTS, load_splits()["motions"]["test"], 40, EVERY
-    tolerances, budgets = TOLERANCES, BUDGETS
+    garments, clips, frames, tolerances, budgets = GARMENTS, split_clips("test"), 40, TOLERANCES, BUDGETS
     if chosen.smoke:
-        garments, clips, frames, every, chosen.sizes = garments[:1], clips[:1], 6, 2, ["1k"]
+        garments, clips, frames, chosen.sizes = garments[:1], clips[:1], 6, ["1k"]
         tolerances, budgets = tolerances[:1], budgets[:1]
     body = load_body()
     motions = [pose_body(body, load_motion(clip), num_frames=frames) for clip in clips]
@@ -98,7 +95,7 @@ def main() -> None:
         for cloth in cloths.values() if tasks else ():  # one body surface for all clips, so one compilation
             scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips), terms=FAST)
         for tolerance in tasks:
-            row = {"size": size, **measure_tolerance(scenes, tolerance, every)}
+            row = {"size": size, **measure_tolerance(scenes, tolerance)}
             put(path, "tolerance", row, ("size", "tolerance"), about)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
         for garment, cloth in cloths.items() if "budget" in chosen.parts else ():

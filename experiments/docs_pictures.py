@@ -6,13 +6,11 @@ Writes PNG files of less than 150 kB. Figures of other experiments are copied fr
 picture of `eslr play` needs Chromium and the package playwright; without them it is left as it is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -120,26 +118,26 @@ def shoot(
     poses = pose_body(body, load_motion(_CLIP), num_frames=frames)
     stored = wear_together([load_garment_file(name, vertices=vertices) for name in garments], garments)
     cloth = prepare_stored(stored, name="+".join(garments))
-    terms = scene_terms(*others)
-    moving = with_settling(poses, SETTLE_FRAMES, body)
-    scene = prepare_scene(
-        cloth, moving, material=garment_material(fabric, cloth, stored), terms=terms, integrator="bdf2"
-    )
+    made = {"material": garment_material(fabric, cloth, stored), "terms": scene_terms(*others)}
+    scene = prepare_scene(cloth, with_settling(poses, SETTLE_FRAMES, body), integrator="bdf2", **made)
     run = simulate(None, scene, config=_CONFIG)
     trajectory, scene = last_frames(run.trajectory, run.scene, frames)
     return Shot(stored, body, poses, scene, trajectory)
 
 
-def figures(
-    shot: Shot, indices: list[int], colors: np.ndarray | None = None, **options: Any
-) -> list[np.ndarray]:
-    """Render frames of a scene."""
-    given = outfit_colors(list(shot.stored.outfit.values())) if colors is None else colors
+def figures(shot: Shot, indices: Sequence[int], **options: Any) -> list[np.ndarray]:
     cloth = shot.trajectory.positions, shot.scene.garment.faces
     mesh = map(np.asarray, (shot.poses.positions, shot.poses.faces, *cloth))
-    look = {"camera": _CAMERA, "size": _SIZE, "vertex_colors": given, **options}
+    colors = outfit_colors(list(shot.stored.outfit.values()))
+    look = {"camera": _CAMERA, "size": _SIZE, "vertex_colors": colors, **options}
     look |= {"rest_positions": np.asarray(shot.poses.rest_positions), "rig": shot.body}
     return list(render_frames(*mesh, frame_indices=indices, **look))
+
+
+def spread(frames: int, count: int) -> tuple[list[int], list[str]]:
+    """Return so many frames from the first to the last, and their times as labels."""
+    indices = np.linspace(0, frames - 1, count).round().astype(int).tolist()
+    return indices, [f"{k / 30:.2f} s" for k in indices]
 
 
 def worn(stored: Any, body: Any, positions: np.ndarray | None = None, **options: Any) -> np.ndarray:
@@ -159,9 +157,8 @@ def install(_: int) -> np.ndarray:
 
 def first_cloth(frames: int) -> np.ndarray:
     """A T-shirt on a walk."""
-    indices = np.linspace(0, frames - 1, 4).round().astype(int).tolist()
-    shot = shoot(("tshirt",), frames)
-    return side_by_side(figures(shot, indices), [f"{k / 30:.2f} s" for k in indices])
+    indices, labels = spread(frames, 4)
+    return side_by_side(figures(shoot(("tshirt",), frames), indices), labels)
 
 
 def own_garment(_: int) -> np.ndarray:
@@ -194,8 +191,8 @@ def own_body(_: int) -> np.ndarray:
 def outfits(frames: int) -> np.ndarray:
     """Trousers and a T-shirt over them."""
     shot = shoot(("pants", "tshirt"), frames, fabric=("pants:denim", "tshirt:jersey"))
-    indices = [0, frames // 2, frames - 1]
-    return side_by_side(figures(shot, indices), [f"{k / 30:.2f} s" for k in indices])
+    indices, labels = spread(frames, 3)
+    return side_by_side(figures(shot, indices), labels)
 
 
 def fabrics(frames: int) -> np.ndarray:
@@ -271,7 +268,8 @@ def field_of(shot: Shot, name: str) -> Field:
 
 def colored(shot: Shot, field: Field, high: float) -> np.ndarray:
     """Render the last frame of a scene in the colours of a field, yellow from a value on."""
-    return figures(shot, [len(field.values) - 1], color_scale(field.values, field.low, high))[0]
+    colors = color_scale(field.values, field.low, high)
+    return figures(shot, [len(field.values) - 1], vertex_colors=colors)[0]
 
 
 def studio(frames: int) -> np.ndarray:
@@ -286,10 +284,10 @@ def studio(frames: int) -> np.ndarray:
     starts = np.cumsum([0, *counts])
     faces = np.concatenate([cloth.faces + start for cloth, start in zip(cloths, starts, strict=False)])
     positions = np.concatenate([cloth.positions for cloth in cloths], axis=1)
-    indices = np.linspace(0, frames - 1, 4).round().astype(int).tolist()
+    indices, labels = spread(frames, 4)
     look = {"camera": _CAMERA, "size": _SIZE, "vertex_colors": outfit_colors(counts)}
     pictures = render_frames(body.positions, body.faces, positions, faces, frame_indices=indices, **look)
-    return side_by_side(list(pictures), [f"{k / 30:.2f} s" for k in indices])
+    return side_by_side(list(pictures), labels)
 
 
 def limits(frames: int) -> np.ndarray:

@@ -8,8 +8,6 @@ relative to one iteration of the solver, so that figures of a busy machine compa
 Writes frame_cost.json.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -37,10 +35,7 @@ from eslr_jax.terms import FAST, Contact, scene_terms
 from eslr_jax.types import Scene
 
 SIZES = ("1k", "4k", "10k", "50k", "200k")
-CASES = {
-    "fast contact": FAST,
-    "strict contact": scene_terms(),
-}
+CASES = {"fast contact": FAST, "strict contact": scene_terms()}
 RATIO = "whole frame with strict contact / with fast"
 CLIP = "cmu_016_32"
 FRAMES = 12  # simulated before the one that is timed

@@ -1,16 +1,11 @@
-"""What the scripts of this folder share: options, results in files, tables, and timing against older code."""
-
-from __future__ import annotations
+"""What the scripts of this folder share: options, results in files, and tables."""
 
 import argparse
-import contextlib
 import importlib
 import json
 import os
-import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +52,11 @@ def machine() -> dict[str, Any]:
     return {"device": device_name(), "environment": environment()}
 
 
+def cores() -> int | None:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
 def kept(path: Path) -> dict[str, Any]:
     """Return a result that was kept before; empty without one."""
     return json.loads(path.read_text()) if path.exists() else {}
@@ -95,38 +95,3 @@ def markdown(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]]) -> s
     lines = [list(columns.values()), ["---"] * len(columns)]
     lines += [[cell(row.get(name)) for name in columns] for row in rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-@contextlib.contextmanager
-def codes(commit: str) -> Iterator[dict[str, Path]]:
-    """Yield the roots of two codes, "before" and "now": a commit in a temporary folder, and this checkout."""
-    root = EXPERIMENTS.parent
-    git = ["git", "-C", str(root), "worktree"]
-    with tempfile.TemporaryDirectory() as folder:
-        older = Path(folder) / "older"
-        subprocess.run([*git, "add", "--quiet", "--detach", older, commit], check=True)
-        try:
-            yield {"before": older, "now": root}
-        finally:
-            subprocess.run([*git, "remove", "--force", older], check=True)
-
-
-def in_turns(
-    roots: Mapping[str, Path], program: str, arguments: list, turns: int = 1
-) -> dict[str, list[Any]]:
-    """Return what a program prints last, as JSON, in every turn of every code of `codes`.
-
-    The program is a text that uses only what all codes have; its arguments are JSON in `sys.argv[1]`. Codes run
-    alternately, in processes of their own, so that what else runs on the machine disturbs them alike.
-
-    Raises:
-        subprocess.CalledProcessError: The program failed; its errors are on standard error.
-    """
-    found: dict[str, list[Any]] = {name: [] for name in roots}
-    command = [sys.executable, "-c", program, json.dumps(arguments)]
-    for _ in range(turns):
-        for name, root in roots.items():
-            about = {"cwd": root, "env": os.environ | {"PYTHONPATH": str(root)}}
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, **about)  # type: ignore[call-overload]
-            found[name].append(json.loads(done.stdout.splitlines()[-1]))
-    return found

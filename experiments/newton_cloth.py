@@ -1,9 +1,8 @@
 """A scene of this package in Newton's cloth solvers: VBD, Style3D and XPBD (extra `peers`).
 
-Newton is Apache-2.0, https://github.com/newton-physics/newton; read in version 1.8.0. The body is one static
-mesh whose points and velocities are set, and whose search tree is refitted, before every substep. Cloth meets it
-by vertices, at the distance that our vertices keep. There is no damping. With self-contact, VBD keeps our
-distance between layers, Style3D its own, and XPBD none between vertices and faces.
+Newton is Apache-2.0, https://github.com/newton-physics/newton; read in version 1.8.0. The body is one static mesh
+that is moved and refitted before every substep. Cloth meets it by vertices, at the distance that ours keep. There
+is no damping. With self-contact, VBD keeps our distance between layers, Style3D its own, XPBD none.
 
 How fabric is carried over (h thickness, mu and lambda Lame, l edge, A the areas of the faces beside it):
 
@@ -16,11 +15,9 @@ How fabric is carried over (h thickness, mu and lambda Lame, l edge, A the areas
   where the constraint is soft.
 
 What can't be carried over: the cubic contact energy becomes a spring, as stiff as ours is on average over the
-contact distance (XPBD: rigid), and XPBD takes no friction speed. Every substep is a step of implicit Euler of its
-own, so with several of them even an exact answer is not the minimum of our potential, which has one step a frame.
+contact distance (XPBD: rigid), and XPBD takes no friction speed. With several substeps even an exact answer is
+not the minimum of our potential, which has one step a frame.
 """
-
-from __future__ import annotations
 
 import contextlib
 import dataclasses
@@ -88,10 +85,7 @@ class Cloth:
 
 
 def strip_stiffness(shear: np.ndarray, area_stiffness: np.ndarray) -> np.ndarray:
-    """Return the tension per width and strain of a strip pulled along one axis, free across it [N/m].
-
-    E h = 4 mu (mu + lambda) h / (2 mu + lambda), of plane stress.
-    """
+    """Return E h of plane stress [N/m], the tension per width and strain of a strip that is free across."""
     return 4.0 * shear * (shear + area_stiffness) / (2.0 * shear + area_stiffness)
 
 
@@ -152,15 +146,8 @@ def bending_cotangents(cloth: Cloth) -> Float[np.ndarray, "hinges 4"]:
         return np.sum(a * b, axis=1) / np.linalg.norm(np.cross(a, b), axis=1)
 
     start, end, left, right = cloth.hinges.T
-    return np.stack(
-        [
-            cotangent(start, end, left),
-            cotangent(start, end, right),
-            cotangent(end, start, left),
-            cotangent(end, start, right),
-        ],
-        axis=1,
-    )
+    pairs = ((start, end), (end, start))
+    return np.stack([cotangent(*pair, tip) for pair in pairs for tip in (left, right)], axis=1)
 
 
 def contact_stiffness(scene: Scene) -> float:
@@ -174,11 +161,7 @@ def contact_stiffness(scene: Scene) -> float:
 
 
 def require_newton() -> ModuleType:
-    """Return Newton.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
+    """Return Newton, or raise MissingExtraError."""
     return require("newton", extra="peers", purpose="the comparison with other simulators")
 
 
@@ -186,11 +169,6 @@ class NewtonCloth:
     """A scene in one of Newton's solvers; steps frames from any state."""
 
     def __init__(self, scene: Scene, setting: Setting) -> None:
-        """Build the model.
-
-        Raises:
-            MissingExtraError: Newton is not installed.
-        """
         newton = require_newton()
         self._warp = require("warp", extra="peers", purpose="the comparison with other simulators")
         self._warp.config.log_level = self._warp.LOG_WARNING  # it would report every kernel it loads
@@ -213,17 +191,14 @@ class NewtonCloth:
         self._body = None
         if scene.body is not None:
             self._body, self._mesh = np.asarray(scene.body.positions), model.shape_source[0].mesh
-            for bound, size in (
-                (model.shape_collision_aabb_lower, -_FAR),
-                (model.shape_collision_aabb_upper, _FAR),
-            ):
-                bound.fill_(self._warp.vec3(size, size, size))
+            model.shape_collision_aabb_lower.fill_(self._warp.vec3(-_FAR, -_FAR, -_FAR))
+            model.shape_collision_aabb_upper.fill_(self._warp.vec3(_FAR, _FAR, _FAR))
         gap = max(_REACH / self.substeps, _LEAST_GAP)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=gap)
         self._contacts = self._pipeline.contacts()
         self._now, self._after = model.state(), model.state()
-        # The first substep loads kernels and sizes buffers, the second is recorded: replayed without Python in
-        # between, frames of 1k vertices take half the time.
+        # The first substep loads kernels and sizes buffers, the second is recorded: replaying it without Python
+        # halves the time of frames of 1k vertices.
         self._substep()
         with self._warp.ScopedCapture() as capture:
             self._substep()
@@ -272,9 +247,8 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     radius = float(contact_thickness(scene.garment, scene.term(Collision).thickness))
     count = len(cloth.rest)
     flags = np.where(cloth.masses > 0, int(newton.ParticleFlags.ACTIVE), 0).tolist()
-    builder.add_particles(
-        cloth.rest.tolist(), [(0.0, 0.0, 0.0)] * count, cloth.masses.tolist(), [radius] * count, flags
-    )
+    still = [(0.0, 0.0, 0.0)] * count
+    builder.add_particles(cloth.rest.tolist(), still, cloth.masses.tolist(), [radius] * count, flags)
     start, end, left, right = cloth.hinges.T
     length = np.linalg.norm(cloth.rest[end] - cloth.rest[start], axis=1)
     stretch, triangles, hinges = strip_stiffness(cloth.shear, cloth.area_stiffness), None, None
@@ -304,10 +278,8 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     if solver == "vbd":
         builder.color(include_bending=True)
     if scene.body is not None:
-        friction = float(scene.term(Friction).coefficient)
-        config = newton.ModelBuilder.ShapeConfig(
-            density=0.0, ke=contact_stiffness(scene), kd=0.0, mu=friction
-        )
+        contact = {"ke": contact_stiffness(scene), "kd": 0.0, "mu": float(scene.term(Friction).coefficient)}
+        config = newton.ModelBuilder.ShapeConfig(density=0.0, **contact)
         faces = np.asarray(scene.body.surface.faces).ravel()
         mesh = newton.Mesh(np.asarray(scene.body.positions[0]), faces, compute_inertia=False)
         builder.add_shape_mesh(-1, mesh=mesh, cfg=config)
@@ -338,11 +310,7 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
 
 
 def newton_simulator(setting: Setting) -> Simulator:
-    """Return a solver of Newton as a simulator of the hard cases.
-
-    Raises:
-        MissingExtraError: Newton is not installed.
-    """
+    """Return a solver of Newton as a simulator of the hard cases; MissingExtraError where it is not installed."""
     require_newton()
 
     def run(scene: Scene) -> Trajectory:

@@ -6,8 +6,6 @@ The bodies are synthetic, since no SMPL model and no bought character may ship: 
 proportions and on other rigs, in T-poses, and a figure of capsules with a surface of its own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 import warnings
@@ -73,17 +71,17 @@ def proportioned(
     for joint, parent in enumerate(skeleton.parents):
         above = places[parent] + maps[parent] @ (rest[joint] - rest[parent])
         places[joint] = above if parent >= 0 else size * rest[joint]
-    blended = np.einsum("vi,vixy->vxy", mesh.skin_weights, maps[mesh.skin_indices])
-    offsets = np.einsum(
-        "vi,vix->vx", mesh.skin_weights, (places - np.einsum("jxy,jy->jx", maps, rest))[mesh.skin_indices]
-    )
-    moved = np.einsum("vxy,vy->vx", blended, mesh.positions) + offsets
-    return dataclasses.replace(mesh, positions=moved, skeleton=moved_skeleton(mesh, places))
+    shifts = places - np.einsum("jxy,jy->jx", maps, rest)
+    transforms = np.concatenate([maps, shifts[:, :, None]], axis=2)
+    blended = np.einsum("vi,vixy->vxy", mesh.skin_weights, transforms[mesh.skin_indices])
+    positions = np.einsum("vxy,vy->vx", blended[:, :, :3], mesh.positions) + blended[:, :, 3]
+    return moved(mesh, positions, places)
 
 
-def moved_skeleton(mesh: RiggedMesh, places: np.ndarray) -> Skeleton:
-    """Return a mesh's skeleton with joints at other places [m]."""
-    return dataclasses.replace(mesh.skeleton, rest_positions=places)
+def moved(mesh: RiggedMesh, positions: np.ndarray, places: np.ndarray) -> RiggedMesh:
+    """Return a body with vertices and joints at other places [m]."""
+    skeleton = dataclasses.replace(mesh.skeleton, rest_positions=places)
+    return dataclasses.replace(mesh, positions=positions, skeleton=skeleton)
 
 
 def posed(mesh: RiggedMesh, arm_angle: float) -> RiggedMesh:
@@ -93,8 +91,7 @@ def posed(mesh: RiggedMesh, arm_angle: float) -> RiggedMesh:
     transforms = np.asarray(poses.joint_transforms[0], np.float64)
     rest = mesh.skeleton.rest_positions
     places = np.einsum("jxy,jy->jx", transforms[:, :, :3], rest) + transforms[:, :, 3]
-    positions = np.asarray(poses.positions[0], np.float64)
-    return dataclasses.replace(mesh, positions=positions, skeleton=moved_skeleton(mesh, places))
+    return moved(mesh, np.asarray(poses.positions[0], np.float64), places)
 
 
 def renamed(
@@ -105,11 +102,16 @@ def renamed(
     weights = np.zeros((len(mesh.positions), len(names)))
     rows = np.arange(len(weights))[:, None]
     np.add.at(weights, (rows, owner[mesh.skin_indices]), mesh.skin_weights)
+    skeleton = Skeleton(names, parents, mesh.skeleton.rest_positions[first])
+    kept, chosen = strongest(weights)
+    return dataclasses.replace(mesh, skin_weights=kept, skin_indices=chosen, skeleton=skeleton)
+
+
+def strongest(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the four largest weights of every vertex, with sum one, and their joints."""
     chosen = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     kept = np.take_along_axis(weights, chosen, axis=1)
-    skeleton = Skeleton(names, parents, mesh.skeleton.rest_positions[first])
-    kept /= kept.sum(1, keepdims=True)
-    return dataclasses.replace(mesh, skin_weights=kept, skin_indices=chosen, skeleton=skeleton)
+    return kept / kept.sum(axis=1, keepdims=True), chosen
 
 
 def bundled_mesh(body: Body | None = None) -> RiggedMesh:
@@ -131,8 +133,7 @@ def smpl_rig(mesh: RiggedMesh) -> RiggedMesh:
         owner[joint] = home[name] if name in home else owner[parents[joint]]
     places = [old.index(theirs) for theirs in _SMPL.values()]
     tree = tuple(-1 if parents[place] < 0 else int(owner[parents[place]]) for place in places)
-    result = renamed(mesh, names, tree, owner)
-    return dataclasses.replace(result, skeleton=moved_skeleton(result, mesh.skeleton.rest_positions[places]))
+    return moved(renamed(mesh, names, tree, owner), mesh.positions, mesh.skeleton.rest_positions[places])
 
 
 def smpl_male() -> RiggedMesh:
@@ -145,25 +146,15 @@ def smpl_male() -> RiggedMesh:
 def smpl_female() -> RiggedMesh:
     """Return a short woman in SMPL's T-pose: narrow shoulders, wide hips."""
     mesh = bundled_mesh(shape_body(load_body(), [-1.6, 0.5, 0.0, 1.0]))
-    mesh = proportioned(
-        mesh,
-        {"clavicle": 0.9},
-        {"spine": 0.92, "upper_arm": 0.85, "forearm": 0.85, "hips": 1.08, "upper_leg": 1.08},
-    )
-    return smpl_rig(posed(mesh, 47.0))
+    girths = {"spine": 0.92, "upper_arm": 0.85, "forearm": 0.85, "hips": 1.08, "upper_leg": 1.08}
+    return smpl_rig(posed(proportioned(mesh, {"clavicle": 0.9}, girths), 47.0))
 
 
 def child() -> RiggedMesh:
     """Return a child of 1.1 m: a large head, short limbs, no waist."""
-    lengths = {
-        "upper_leg": 0.78,
-        "lower_leg": 0.76,
-        "upper_arm": 0.85,
-        "forearm": 0.85,
-        "neck": 0.8,
-        "head": 1.35,
-    }
-    girths = {"head": 1.4, "neck": 1.05, "upper_arm": 1.05, "clavicle": 0.95, "hips": 1.0, "spine": 1.0}
+    lengths = {"upper_leg": 0.78, "lower_leg": 0.76, "upper_arm": 0.85, "forearm": 0.85}
+    lengths |= {"neck": 0.8, "head": 1.35}
+    girths = {"head": 1.4, "neck": 1.05, "upper_arm": 1.05, "clavicle": 0.95}
     return smpl_rig(proportioned(bundled_mesh(), lengths, girths, size=0.68))
 
 
@@ -175,11 +166,10 @@ def mixamo() -> RiggedMesh:
     mesh = posed(mesh, 47.0)
     names = tuple(f"mixamorig:{_MIXAMO.get(name, name)}" for name in mesh.skeleton.joint_names)
     mesh = renamed(mesh, names, mesh.skeleton.parents, np.arange(len(names)))
-    places = 100.0 * mesh.skeleton.rest_positions
-    return dataclasses.replace(mesh, positions=100.0 * mesh.positions, skeleton=moved_skeleton(mesh, places))
+    return moved(mesh, 100.0 * mesh.positions, 100.0 * mesh.skeleton.rest_positions)
 
 
-# A figure of capsules: (joint, parent, place [m], radius at the joint and at its end, end), VRM's names.
+# A figure of capsules: joint by VRM's name, parent, place [m].
 _FIGURE = (
     ("C_Hips", -1, (0.0, 0.52, 0.0)), ("C_Spine", 0, (0.0, 0.60, 0.0)),
     ("C_Chest", 1, (0.0, 0.72, 0.0)), ("C_Neck", 2, (0.0, 0.86, 0.0)),
@@ -226,13 +216,9 @@ def figure() -> RiggedMesh:
     closeness = np.exp(-np.maximum(_capsule_distances(positions), 0.0) / 0.015)
     weights = np.zeros((len(positions), len(_FIGURE)))
     np.add.at(weights, (slice(None), [joint for joint, *_ in _CAPSULES]), closeness)
-    chosen = np.argsort(-weights, axis=1)[:, :4]
-    kept = np.take_along_axis(weights, chosen, axis=1)
-    names = tuple(f"J_Bip_{name}" for name, *_ in _FIGURE)
-    skeleton = Skeleton(
-        names, tuple(parent for _, parent, _ in _FIGURE), np.array([p for *_, p in _FIGURE], float)
-    )
-    return RiggedMesh("figure", positions, faces, kept / kept.sum(1, keepdims=True), chosen, skeleton)
+    names, parents, places = zip(*_FIGURE, strict=True)
+    skeleton = Skeleton(tuple(f"J_Bip_{name}" for name in names), parents, np.array(places, float))
+    return RiggedMesh("figure", positions, faces, *strongest(weights), skeleton)
 
 
 def _capsule_distances(points: np.ndarray) -> np.ndarray:
@@ -247,18 +233,13 @@ def _capsule_distances(points: np.ndarray) -> np.ndarray:
 
 
 BODIES = {make.__name__: make for make in (smpl_male, smpl_female, child, mixamo, figure)}
-
-
 GARMENTS = (
     "tshirt", "tank", "longsleeve", "shortsleeve", "dress", "tightdress", "shorts", "kneepants", "pants",
 )  # fmt: skip
-CLIP = "cmu_016_32"  # a walk
-FRAMES = 100  # of it
+CLIP, FRAMES = "cmu_016_32", 100  # a walk, and frames of it
 STILL, RAISE = 50, 25  # frames that the body stands, and in which it lifts its arms to its own rest pose
 STANDING = 45.0  # [degrees] of the arms below the horizontal, as garments are cut
-SMOKE_FRAMES = STILL  # of the walk
-ITERATIONS = 30  # of the solver
-CONFIG = SimConfig(iterations=ITERATIONS)
+CONFIG = SimConfig(iterations=30)
 
 
 def standing_motion(body: Body, frames: int) -> Motion:
@@ -277,25 +258,21 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
     own = [load_garment(name, vertices=vertices, body=body, cache=False) for name in garments]  # type: ignore[arg-type]
     took = (time.perf_counter() - began) / len(own)
     cloths = pad_alike(own, common_bucket([choose_bucket(cloth) for cloth in own]))
-    surface = obstacle_surface(body)  # bodies of one topology then share a program
     options = {"terms": scene_terms(without=(Ground,)), "integrator": "bdf2"}
+    options["surface"] = obstacle_surface(body)  # bodies of one topology then share a program
     still = pose_body(body, standing_motion(body, SETTLE_FRAMES + frames))
     walk = pose_body(body, load_motion(CLIP, body=body), num_frames=frames)
     for name, cloth in zip(garments, cloths, strict=True):
         is_real = np.asarray(cloth.vertex_mask)
-        runs = [
-            simulate(
-                None,
-                prepare_scene(cloth, poses, **options, surface=surface),
-                config=CONFIG,
-                raises=False,
-            )
+        standing, walking = (
+            simulate(None, prepare_scene(cloth, poses, **options), config=CONFIG, raises=False)
             for poses in (still, with_settling(walk, SETTLE_FRAMES, body))
-        ]
-        at_rest = jax.device_get(measure_frames(runs[0].trajectory.positions, runs[0].scene))
-        trajectory, scene = last_frames(runs[1].trajectory, runs[1].scene, frames)
+        )
+        at_rest = jax.device_get(measure_frames(standing.trajectory.positions, standing.scene))
+        trajectory, scene = last_frames(walking.trajectory, walking.scene, frames)
         moving = trajectory_report(trajectory, scene, poses=walk)
         positions = np.asarray(trajectory.positions)[:, is_real]
+        depth = -at_rest.distances[[STILL - 1, -1]][:, is_real].min()  # of the deepest vertex [m]
         heights, _ = body_heights(np.asarray(cloth.rest_positions, np.float64)[is_real], rest_posture(body))
         yield (
             {
@@ -306,7 +283,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
                 "standing_p99_stretch": float(at_rest.p99_stretch[STILL - 1]),
                 "rest_max_stretch": float(at_rest.max_stretch[-1]),
                 "rest_p99_stretch": float(at_rest.p99_stretch[-1]),
-                "rest_inside_mm": _depth(at_rest.distances[[STILL - 1, -1]][:, is_real]),
+                "rest_inside_mm": float(max(depth, 0.0) * 1e3),
                 "walk_finite": moving["finite"] and int(trajectory.status) == 0,
                 "walk_p99_stretch": moving["p99_principal_stretch"],
                 "walk_max_stretch": moving["max_principal_stretch"],
@@ -320,18 +297,13 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
         )
 
 
-def _depth(distances: np.ndarray) -> float:
-    """Return how deep the deepest vertex is inside [mm]."""
-    return float(max(-np.asarray(distances).min(), 0.0) * 1e3)
-
-
 def main() -> None:
     options = parser(__doc__, "one garment, one body, few frames")
     options.add_argument("--bodies", nargs="+", default=["bundled", *BODIES], choices=["bundled", *BODIES])
     chosen = options.parse_args()
     names, garments = (["mixamo"], GARMENTS[:1]) if chosen.smoke else (chosen.bodies, GARMENTS)
     path = chosen.out / "other_bodies.json"
-    about = {"clip": CLIP, "frames": FRAMES, "iterations": ITERATIONS, **environment()}
+    about = {"clip": CLIP, "frames": FRAMES, "iterations": CONFIG.iterations, **environment()}
     table: dict[str, Any] = {**kept(path), **about}
     for name in names:
         with warnings.catch_warnings():
@@ -340,7 +312,7 @@ def main() -> None:
         rows, pictures = [], []
         dressed = {"rest_positions": np.asarray(body.rest_positions), "rig": body, "follows": False}
         for row, (moving, positions, faces) in measure(
-            body, garments, frames=SMOKE_FRAMES if chosen.smoke else FRAMES
+            body, garments, frames=STILL if chosen.smoke else FRAMES
         ):
             print(name, row, flush=True)
             rows.append(row)

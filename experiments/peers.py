@@ -5,44 +5,38 @@
     python experiments/peers.py --smoke --out DIR
 
 The methods are timed alternately, frame by frame, so that whatever disturbs the machine disturbs all of them.
-Times are medians over frames, after kernels are compiled and first frames are run. `frame_cpu_ms` is CPU time:
-Newton uses one core, and ours uses all that it gets, so give the process one core to compare them
-(`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The gap is
-teacher-forced: every frame starts from a state of our near-optimal rollout, and its gap in our potential is
-relative to the initial gap. A method with substeps solves a finer problem; the row of our own solver with
-substeps shows the gap that substeps alone cause. The gap on its own rollout is that of the frames that a method
-simulated.
+Times are medians over frames. `frame_cpu_ms` is CPU time: Newton uses one core, and ours uses all that it gets,
+so give the process one core to compare them (`taskset -c 0` on Linux). Stretch, penetration and intersections are
+those of the free rollout. The gap is relative to the initial gap, of frames from states of our near-optimal
+rollout, and of the frames that a method simulated itself. A method with substeps solves a finer problem; the row
+of our own solver with substeps shows the gap that they alone cause.
 
 Blender can only run through from a start at rest: it comes after the others, and has no teacher-forced gap.
 Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a Python with `bpy`
 (`python3.11 -m venv blender && blender/bin/pip install bpy`). What is missing is left out. Writes peers.json.
 """
 
-from __future__ import annotations
-
-import dataclasses
 import importlib.metadata
 import os
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from blender_cloth import blender_python, run_blender
-from harness import keep, kept, markdown, parser
+from harness import cores, keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
-from eslr_jax import SimConfig, Trajectory, score_trajectory
-from eslr_jax.errors import MissingExtraError, NonFiniteError
+from eslr_jax import MissingExtraError, NonFiniteError, SimConfig, rollout_scene, score_trajectory
 from eslr_jax.pipeline.assets.budget import device_name
 from eslr_jax.pipeline.report.calibrate import example_scene
 from eslr_jax.pipeline.report.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
-from eslr_jax.simulation.rollout import rollout_scene, step_frame
+from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.terms import Contact
 from eslr_jax.terms.contact import starting_rows
@@ -72,19 +66,12 @@ TIMED_FRAMES = 20  # of `peer_points`
 Step = Callable[[ClothState, int], ClothState]  # from a state at a frame to the next
 
 
-@dataclasses.dataclass(frozen=True)
-class Method:
+class Method(NamedTuple):
     """A way to step one scene."""
 
     name: str
-    substeps: int
-    iterations: int  # per substep
+    effort: str  # substeps x iterations
     step: Step
-
-    @property
-    def effort(self) -> str:
-        """Substeps times iterations, as tables show them."""
-        return f"{self.substeps}x{self.iterations}"
 
 
 def our_method(scene: Scene, substeps: int, iterations: int, name: str = "ours") -> Method:
@@ -99,7 +86,7 @@ def our_method(scene: Scene, substeps: int, iterations: int, name: str = "ours")
     def run(state: ClothState, frame: int) -> ClothState:
         return advance(constant, state, jax.tree.map(lambda leaf: leaf[frame], inputs))
 
-    return Method(name, substeps, iterations, run)
+    return Method(name, f"{substeps}x{iterations}", run)
 
 
 def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
@@ -110,40 +97,37 @@ def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
         print(f"peers left out: {error}", file=sys.stderr)
         return []
     cloths = [(setting, NewtonCloth(scene, setting)) for setting in settings]
-    return [Method(s.name, cloth.substeps, s.iterations, cloth) for s, cloth in cloths]
+    return [Method(s.name, f"{cloth.substeps}x{s.iterations}", cloth) for s, cloth in cloths]
 
 
-def take_turns(
-    methods: list[Method], scene: Scene, num_frames: int
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+def take_turns(methods: list[Method], scene: Scene, num_frames: int) -> tuple[list[np.ndarray], np.ndarray]:
     """Roll all methods out, frame by frame in turns, to a number of frames with the start.
 
     Returns:
-        Per method positions [m], shape [frames, vertices, 3]; and wall and processor time per frame [ms].
+        Per method positions [m], shape [frames, vertices, 3]; wall and processor time [ms], shape [2, methods,
+        frames - 1].
     """
     for method in methods:  # compiles
         jax.block_until_ready(method.step(scene.initial_state, 0))
     states = [scene.initial_state] * len(methods)
     positions = [[np.asarray(scene.initial_state.position)] for _ in methods]
-    wall, processor = [[] for _ in methods], [[] for _ in methods]
+    times = np.empty((2, len(methods), num_frames - 1))
     for frame in range(num_frames - 1):
         for k, method in enumerate(methods):
-            began, began_processor = time.perf_counter(), time.process_time()
+            began = time.perf_counter(), time.process_time()
             states[k] = jax.block_until_ready(method.step(states[k], frame))
-            wall[k].append(1e3 * (time.perf_counter() - began))
-            processor[k].append(1e3 * (time.process_time() - began_processor))
+            times[:, k, frame] = time.perf_counter() - began[0], time.process_time() - began[1]
             positions[k].append(np.asarray(states[k].position))
-    return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
+    return [np.stack(rows) for rows in positions], 1e3 * times
 
 
-def teach(
-    methods: list[Method], scene: Scene, truth: Trajectory, every: int
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return every method's gap [J] a frame after every so many states of `truth`, and the initial gaps [J]."""
-    ends = trajectory_gap(truth, scene, every=every)
+def teach(methods: list[Method], scene: Scene) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return every method's gap [J] a frame after near-optimal states, and the initial gaps [J]."""
+    truth = rollout_scene(None, scene, SimConfig(iterations=500))
+    ends = trajectory_gap(truth, scene, every=EVERY)
     states, inputs = trajectory_states(truth, scene)
-    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
-    frames = range(1, scene.num_frames - 1, every)
+    taken = jax.tree.map(lambda leaf: leaf[1::EVERY], (states, inputs))
+    frames = range(1, scene.num_frames - 1, EVERY)
     gap = []
     for method in methods:
         reached = [
@@ -155,7 +139,7 @@ def teach(
     return gap, np.asarray(ends.initial_gap)
 
 
-def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[str, Any]:
+def describe_rollout(positions: np.ndarray, scene: Scene, every: int = EVERY) -> dict[str, Any]:
     """Return the measures of a free rollout, gap every so many frames; None where it did not stay finite."""
     try:
         score = score_trajectory(positions, scene, every=every)
@@ -164,53 +148,40 @@ def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[st
     return {"finite": True, **{column: score[name] for name, column in SCORE.items()}}
 
 
-def measure_scene(
-    scene: Scene,
-    efforts: tuple[tuple[int, int], ...],
-    strictly: tuple[tuple[int, int], ...],
-    settings: tuple[Setting, ...],
-    blender: tuple[tuple[int, int], ...],
-    every: int,
-) -> list[dict[str, Any]]:
+def row_of(
+    method: str, effort: str, wall: np.ndarray, processor: np.ndarray, positions: np.ndarray, scene: Scene
+) -> dict[str, Any]:
+    """Return a method's row of a table."""
+    times = {"frame_ms": float(np.median(wall)), "frame_cpu_ms": float(np.median(processor))}
+    return {"method": method, "effort": effort, **times, **describe_rollout(positions, scene)}
+
+
+def measure_scene(scene: Scene, is_smoke: bool) -> list[dict[str, Any]]:
     """Return a row of plain values per method and effort: ours, with strict contact, Newton's, Blender's."""
-    methods = [our_method(scene, *effort) for effort in efforts]
-    if scene.body is not None:
-        rows = starting_rows(scene.garment.vertex_mask.shape[0])
-        strict = scene.replace(terms=(*scene.terms, Contact(rows=rows)))
-        methods += [our_method(strict, *effort, "ours, strict") for effort in strictly]
-    methods += newton_methods(scene, settings)
-    truth = rollout_scene(None, scene, SimConfig(iterations=500))
-    positions, wall, processor = take_turns(methods, scene, scene.num_frames)
-    gap, initial = teach(methods, scene, truth, every)
+    methods = [our_method(scene, *effort) for effort in (OURS[-1:] if is_smoke else OURS)]
+    rows = starting_rows(scene.garment.vertex_mask.shape[0])
+    strict = scene.replace(terms=(*scene.terms, Contact(rows=rows)))
+    methods += [our_method(strict, *effort, "ours, strict") for effort in (() if is_smoke else OUR_STRICT)]
+    methods += newton_methods(scene, SMOKE_SETTINGS if is_smoke else SETTINGS)
+    positions, (wall, processor) = take_turns(methods, scene, scene.num_frames)
+    gap, initial = teach(methods, scene)
     rows = [
-        {
-            "method": method.name,
-            "effort": method.effort,
-            "frame_ms": float(np.median(wall[k])),
-            "frame_cpu_ms": float(np.median(processor[k])),
-            **describe_rollout(positions[k], scene, every),
-            **summarize_gap(gap[k], initial),
-        }
+        row_of(method.name, method.effort, wall[k], processor[k], positions[k], scene)
+        | summarize_gap(gap[k], initial)
         for k, method in enumerate(methods)
     ]
-    return rows + blender_rows(scene, blender, every)
+    return rows + blender_rows(scene, BLENDER[:1] if is_smoke else BLENDER)
 
 
-def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int) -> list[dict[str, Any]]:
+def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
     """Return a row per effort of Blender's; none, and a line that says what is missing, without it."""
     if blender_python() is None:
         print("Blender left out: BLENDER_PYTHON names no Python with bpy", file=sys.stderr)
         return []
-    runs = [run_blender(scene, effort) for effort in efforts]
+    runs = {"{}x{}".format(*effort): run_blender(scene, effort) for effort in efforts}
     return [
-        {
-            "method": f"Blender {run.version}",
-            "effort": f"{steps}x{rounds}",
-            "frame_ms": float(np.median(run.wall)),
-            "frame_cpu_ms": float(np.median(run.processor)),
-            **describe_rollout(run.positions, scene, every),
-        }
-        for (steps, rounds), run in zip(efforts, runs, strict=True)
+        row_of(f"Blender {run.version}", effort, run.wall, run.processor, run.positions, scene)
+        for effort, run in runs.items()
     ]
 
 
@@ -228,24 +199,27 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
     if not methods[0]:
         return {}
     methods += [newton_methods(scene, settings) for scene in scenes[1:]]
-    _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
+    _, (wall, _) = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
     for scene, of_scene in zip(scenes, methods, strict=True):
-        truth = rollout_scene(None, scene, SimConfig(iterations=500))
-        gap, initial = teach(of_scene, scene, truth, EVERY)
+        gap, initial = teach(of_scene, scene)
         relative.append([np.maximum(values, 0.0) / initial for values in gap])
     points: dict[str, list[dict[str, Any]]] = {}
     for k, method in enumerate(methods[0]):
         shares = np.concatenate([values[k] for values in relative])
         if np.isfinite(shares).all():
-            points.setdefault(method.name, []).append(
-                {
-                    "iterations": method.effort,
-                    "frame_ms": float(np.median(wall[k])),
-                    "gap_relative_median": float(np.median(shares)),
-                    "gap_relative_p99": float(np.quantile(shares, 0.99)),
-                }
-            )
+            row = point(method.effort, float(np.median(wall[k])), shares)
+            points.setdefault(method.name, []).append(row)
     return points
+
+
+def point(iterations: int | str, frame_ms: float, shares: np.ndarray) -> dict[str, Any]:
+    """Return a point of speed against error; shares are gaps relative to the initial gap."""
+    return {
+        "iterations": iterations,
+        "frame_ms": frame_ms,
+        "gap_relative_median": float(np.median(shares)),
+        "gap_relative_p99": float(np.quantile(shares, 0.99)),
+    }
 
 
 COLUMNS = {
@@ -259,13 +233,8 @@ COLUMNS = {
 
 def peer_versions() -> dict[str, str]:
     """Return the versions of the peers' packages that are installed."""
-    versions = {}
-    for package in ("newton", "warp-lang", "ipctk"):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
+    installed = {package.name: package.version for package in importlib.metadata.distributions()}
+    return {name: installed[name] for name in ("newton", "warp-lang", "ipctk") if name in installed}
 
 
 def main() -> None:
@@ -273,21 +242,17 @@ def main() -> None:
     options.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
     options.add_argument("--frames", type=int, default=40)
     chosen = options.parse_args()
-    efforts, strictly, settings, blender = OURS, OUR_STRICT, SETTINGS, BLENDER
     if chosen.smoke:
         chosen.scenes, chosen.frames = ["tshirt_1k"], 8
-        efforts, strictly, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
-        "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores,
+        "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores(),
         "date": time.strftime("%Y-%m-%d"), **environment(),
         "scenes": kept(chosen.out / "peers.json").get("scenes", {}),
     }  # fmt: skip
     result["versions"] |= peer_versions()
     for name in chosen.scenes:
         scene = example_scene(*name.split("_"), CLIP, chosen.frames)
-        rows = measure_scene(scene, efforts, strictly, settings, blender, EVERY)
-        result["scenes"][name] = rows
+        result["scenes"][name] = rows = measure_scene(scene, chosen.smoke)
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
         keep(chosen.out / "peers.json", result)
         percent = [

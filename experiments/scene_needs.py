@@ -5,8 +5,6 @@
 The same solver steps two scenes that differ in one part, and they are timed alternately. Writes scene_needs.json.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -9,8 +9,6 @@ of its own on one core; without PyTorch it is left out.
 Writes step_time.json.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import json
@@ -23,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from harness import EXPERIMENTS, keep, parser
+from harness import EXPERIMENTS, cores, keep, parser
 
 from eslr_jax.networks.apply import apply_model, measure_statistics, merge_statistics
 from eslr_jax.networks.build import build_graph
@@ -36,11 +34,12 @@ sys.path.append(str(EXPERIMENTS.parent / "tests"))  # of reference_models
 
 SIZES = {"1k": (32, 32), "4k": (64, 64), "12k": (110, 110), "50k": (224, 224)}
 MODEL = "eslr-15"
+OPTIMIZER = optax.adam(1e-4)
 
 
 def take_turns(functions: dict, turns: int) -> dict[str, float]:
-    """Return the median seconds of compiled functions, called in turns after one warm-up."""
-    return {name: 1e-3 * float(np.median(times)) for name, times in time_in_turns(functions, turns).items()}
+    """Return the median milliseconds of compiled functions, called in turns after one warm-up."""
+    return {name: float(np.median(times)) for name, times in time_in_turns(functions, turns).items()}
 
 
 def compile_timed(function, args) -> tuple:
@@ -80,17 +79,15 @@ def builds_of(config) -> dict:
 
 def training_step(build):
     """Return a step of Adam on a quadratic loss: forward, backward, update."""
-    optimizer = optax.adam(1e-4)
 
     def step(network, graph, garment, state):
         def loss(params):
             return jnp.sum(build(network.replace(params=params), graph, garment) ** 2)
 
-        gradient = jax.grad(loss)(network.params)
-        update, state = optimizer.update(gradient, state)
+        update, state = OPTIMIZER.update(jax.grad(loss)(network.params), state)
         return optax.apply_updates(network.params, update), state
 
-    return step, optimizer.init
+    return step
 
 
 def measure_size(size: str, turns: int, training: bool) -> dict:
@@ -101,24 +98,21 @@ def measure_size(size: str, turns: int, training: bool) -> dict:
         "edges": int(garment.senders.shape[0]),
         "builds": {},
     }
-    forwards = {}
-    for name, build in builds_of(network.config).items():
-        args = (network, graph, garment)
-        compiled, result["builds"][f"forward_{name}"] = compile_timed(build, args)
-        forwards[f"forward_{name}"] = (compiled, args)
-    times = take_turns(forwards, turns)
+    args, builds, times = (network, graph, garment), builds_of(network.config), {}
+    kinds: dict[str, tuple] = {"forward": (builds, args, turns)}
     if training:
-        steps = {}
-        for name, build in builds_of(network.config).items():
-            step, init = training_step(build)
-            args = (network, graph, garment, init(network.params))
-            compiled, result["builds"][f"train_{name}"] = compile_timed(step, args)
-            steps[f"train_{name}"] = (compiled, args)
-        times.update(take_turns(steps, max(3, turns // 2)))
-    for name, seconds in times.items():
-        result["builds"][name]["run_ms"] = round(1e3 * seconds, 2)
-        result["builds"][name]["us_per_vertex"] = round(1e6 * seconds / result["vertices"], 2)
-    for kind in ("forward", "train")[: 1 + training]:
+        steps = {name: training_step(build) for name, build in builds.items()}
+        kinds["train"] = (steps, (*args, OPTIMIZER.init(network.params)), max(3, turns // 2))
+    for kind, (functions, given, repeats) in kinds.items():
+        compiled = {}
+        for name, function in functions.items():
+            program, result["builds"][f"{kind}_{name}"] = compile_timed(function, given)
+            compiled[f"{kind}_{name}"] = (program, given)
+        times |= take_turns(compiled, repeats)
+    for name, milliseconds in times.items():
+        result["builds"][name]["run_ms"] = round(milliseconds, 2)
+        result["builds"][name]["us_per_vertex"] = round(1e3 * milliseconds / result["vertices"], 2)
+    for kind in kinds:
         for build in ("exact", "reduced"):
             result[f"{kind}_{build}_vs_plain"] = ratio(times, f"{kind}_plain", f"{kind}_{build}")
     return result
@@ -147,7 +141,7 @@ def measure_torch(size: str, turns: int) -> dict:
     return {
         "torch": torch.__version__,
         "threads": 1,
-        "run_ms": {name: round(1e3 * seconds, 1) for name, seconds in times.items()},
+        "run_ms": {name: round(milliseconds, 1) for name, milliseconds in times.items()},
         **{
             f"{model}_{build}_vs_torch_mgn15": ratio(times, "torch mgn-15", f"{model[:-2]}-15 {build}")
             for model in ("eslr15", "mgn15")
@@ -162,13 +156,12 @@ def torch_in_a_process(size: str, turns: int, keeps_memory: bool) -> dict | None
         return None
     core = max(os.sched_getaffinity(0))
     code = (
-        f"import json, os, sys; os.sched_setaffinity(0, {{{core}}})\n"
-        f"sys.path.insert(0, {str(EXPERIMENTS)!r})\n"
+        f"import json, os; os.sched_setaffinity(0, {{{core}}})\n"
         f"import step_time; {keeps_memory} and step_time.keep_memory()\n"
         f"print(json.dumps(step_time.measure_torch({size!r}, {turns})))"
     )
-    process = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "capture_output": True, "text": True}
-    done = subprocess.run([sys.executable, "-c", code], check=False, **process)  # type: ignore[call-overload]
+    process: dict = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", code], check=False, cwd=EXPERIMENTS, **process)
     if done.returncode:
         print(done.stderr[-2000:], file=sys.stderr)
         return None
@@ -200,7 +193,7 @@ def main() -> None:
     report = {
         "model": MODEL,
         "sizes": sizes,
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": cores(),
         "keeps_memory": options.keep_memory,
         "load": round(os.getloadavg()[0], 1),
         **environment(),

@@ -4,12 +4,8 @@
 
 T-shirt and dress on three clips against BDF2 at 1/960 s, by both integrators with one to eight steps a frame. All
 begin with the same settled cloth. The cost is CPU time, which other jobs do not change much; it is null where the
-program was compiled during the measurement.
-
-Rows of timestep.json stay until they are measured again.
+program was compiled meanwhile. Rows of timestep.json stay until they are measured again.
 """
-
-from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
@@ -18,15 +14,14 @@ from typing import Any
 import numpy as np
 from harness import parser, put
 
-from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, simulate
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scenes, simulate
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.pipeline.assets import split_clips
 from eslr_jax.pipeline.cli.console import use_compile_cache
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.simulation.scene import Integrator, start_integrator
-from eslr_jax.types import Scene
+from eslr_jax.types import BodyMotion, Scene
 
 NAMES = ("garment", "vertices", "clip", "integrator", "steps")  # of a row
 FPS = 30.0
@@ -53,17 +48,15 @@ def measure_time(
     counts: dict[Integrator, tuple[int, ...]] = {"euler": (1,), "bdf2": (1,)} if is_smoke else STEPS
     cloths, body = [load_garment(name, vertices=vertices) for name in garments], load_body()
 
-    def posed(steps: int) -> list[Scene]:
+    def posed(steps: int) -> list[BodyMotion]:
         length = (frames - 1) * steps + 1
-        motions = [pose_body(body, load_motion(clip), fps=FPS * steps, num_frames=length) for clip in clips]
-        return make_scenes(cloths, motions)
+        return [pose_body(body, load_motion(clip), fps=FPS * steps, num_frames=length) for clip in clips]
 
-    usual = [pose_body(body, load_motion(clip), fps=FPS, num_frames=frames) for clip in clips]
-    settling = make_scenes(cloths, [with_settling(poses, SETTLE_FRAMES, body) for poses in usual])
+    settling = make_scenes(cloths, [with_settling(poses, SETTLE_FRAMES, body) for poses in posed(1)])
     starts = [simulate(None, scene, config=FINE).trajectory.positions[SETTLE_FRAMES] for scene in settling]
 
     def run(integrator: Integrator, steps: int) -> Iterator[tuple[np.ndarray, float | None]]:
-        for scene, start in zip(posed(steps), starts, strict=True):
+        for scene, start in zip(make_scenes(cloths, posed(steps)), starts, strict=True):
             state = start_integrator(scene.initial_state.replace(position=start), integrator)
             ready = scene.replace(initial_state=state)
             began = time.process_time()
@@ -97,9 +90,9 @@ def main() -> None:
     chosen = options.parse_args()
 
     use_compile_cache()
-    clips, is_smoke = list(load_splits()["motions"]["test"]), chosen.smoke
-    garments = chosen.garment[: 1 if is_smoke else None]
-    for row in measure_time(garments, chosen.vertices, clips[: 1 if is_smoke else 3], is_smoke):
+    garments = chosen.garment[: 1 if chosen.smoke else None]
+    clips = split_clips("test")[: 1 if chosen.smoke else 3]
+    for row in measure_time(garments, chosen.vertices, clips, chosen.smoke):
         put(chosen.out / "timestep.json", "time", row, NAMES, environment())
         print(row, flush=True)
 

@@ -4,8 +4,6 @@ Every edge set gathers and concatenates both ends before its perceptron, sums go
 body vertices pass through the vertex perceptron. Architecture: HOOD's fine15 and fine48.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

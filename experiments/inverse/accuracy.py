@@ -3,13 +3,10 @@
     python experiments/inverse accuracy [--smoke] [--out DIR]
 
 The loss is the garment's mean height, the parameters are stretch stiffness, bending stiffness, density and a lift
-of the body, in float32. They are compared with central differences in float64. A crumpled sheet has many minima
-beside each other, so float64 starts each frame where float32 came to rest, and goes on to where float64 ends. How
-far that is, is in the result. The cost is the processor time of loss and gradient over that of the loss alone,
-timed in turns. Writes accuracy.json.
+of the body. Float32 is compared with central differences in float64. A crumpled sheet has many minima beside each
+other, so float64 starts each frame where float32 came to rest; how far it goes from there is in the result. The
+cost is the processor time of loss and gradient over that of the loss alone, in turns. Writes accuracy.json.
 """
-
-from __future__ import annotations
 
 import time
 from collections.abc import Callable
@@ -20,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from harness import keep, machine, parser
 
-from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body
+from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body, rollout_scene
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.scene import build_scene
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.solve import Start, solve
@@ -62,7 +58,6 @@ def changed(scene: Scene, change: Change) -> Scene:
 
 
 def unchanged() -> Change:
-    """Return no change of any parameter."""
     return dict.fromkeys(STEPS, jnp.zeros(()))
 
 
@@ -100,7 +95,6 @@ def differences(scene: Scene, rests: np.ndarray, iterations: int) -> tuple[dict[
 
 
 def measure(garment: str, frames: tuple[int, ...], turns: int, iterations: int) -> dict[str, Any]:
-    """Return gradients, their errors and their cost."""
     scene = jax.tree.map(jnp.asarray, walk(garment, frames[-1]))
     value, slope = jax.jit(height), jax.jit(jax.value_and_grad(height, has_aux=True))
     found = {frame: slope(unchanged(), scene, frame) for frame in frames}
@@ -130,7 +124,6 @@ def measure(garment: str, frames: tuple[int, ...], turns: int, iterations: int) 
 
 
 def processor_time(function: Callable, arguments: tuple) -> float:
-    """Return the processor time that a call takes [s]."""
     began = time.process_time()
     jax.block_until_ready(function(*arguments))
     return time.process_time() - began

@@ -2,13 +2,10 @@
 
     python experiments/inverse fabric [--smoke] [--out DIR]
 
-The sheet hangs from two corners, one of which a hand moves. Weight and inertia grow with the density, so motion
-in the air shows only stiffness over density. A washer of known mass on a free corner does not grow with it and
-tells the three apart. "Measured" is a simulation with the true fabric, without noise. Writes fabric.json and
-fabric.png.
+The sheet hangs from two corners, one of which a hand moves. Motion in the air shows only stiffness over density;
+a washer of known mass on a free corner tells the three apart. "Measured" is a simulation with the true fabric,
+without noise. Writes fabric.json and fabric.png.
 """
-
-from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +13,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from harness import keep, parser, save
 
-from eslr_jax.config import SimConfig
+from eslr_jax import Material, SimConfig, rollout_scene
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.report.report import environment
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Material, Scene
+from eslr_jax.types import Scene
 from inverse.search import Search, descend, gradient_cost, search_simplex
 from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 
@@ -62,17 +58,16 @@ def main() -> None:
         changed = scene.replace(material=fabric(logs, scene))
         return rollout_scene(None, changed, SimConfig(iterations=iterations)).positions
 
-    def loss(logs: jax.Array, measured: jax.Array) -> jax.Array:
+    def loss(logs: jax.Array) -> jax.Array:
         return jnp.mean(jnp.sum((simulate(logs) - measured) ** 2, axis=-1)) * 1e6  # [mm^2]
 
     measured = simulate(jnp.zeros(3))
     value, value_and_grad = jax.jit(loss), jax.jit(jax.value_and_grad(loss))
-    functions = tuple(lambda logs, f=f: f(logs, measured) for f in (value, value_and_grad))
-    cost = gradient_cost(*functions, np.log(STARTS[0]), turns)
+    cost = gradient_cost(value, value_and_grad, np.log(STARTS[0]), turns)
     runs = []
     for start in np.log(STARTS[:1] if options.smoke else STARTS):
-        by_gradient = descend(functions[1], start, steps)
-        runs.append((by_gradient, search_simplex(functions[0], start, round(cost * steps))))
+        by_gradient = descend(value_and_grad, start, steps)
+        runs.append((by_gradient, search_simplex(value, start, round(cost * steps))))
     result = {
         "what": NAMES, "starts": STARTS, "gradient_in_evaluations": round(cost, 2),
         "lbfgs": [report(run, cost) for run, _ in runs],
@@ -103,13 +98,10 @@ def sensitivities(simulate) -> dict[str, float]:
     moves = [(simulate(0.1 * axis) - simulate(-0.1 * axis)).ravel() / 0.2 * 1e3 for axis in jnp.eye(3)]
     singular = np.linalg.svd(np.stack(moves), compute_uv=False)
     scale = np.sqrt(len(moves[0]) / 3)
-    return {
-        name: float(size / scale) for name, size in zip(("most", "middle", "least"), singular, strict=True)
-    }
+    return dict(zip(("most", "middle", "least"), (singular / scale).tolist(), strict=True))
 
 
 def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, scene: Scene) -> plt.Figure:
-    """Return the motion and the searches."""
     figure = plt.figure(figsize=(12, 5), layout="constrained")
     motion = figure.add_subplot(1, 2, 1, projection="3d")
     shades = plt.get_cmap("viridis")(np.linspace(0, 0.9, FRAMES))

@@ -7,23 +7,19 @@ sleeves) is let out along its normals. The loss is the stretch on the body above
 frames in which the cloth comes to rest, and a small price for letting out. Writes fit.json.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from harness import keep, parser
 
-from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene
+from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene, rollout_scene
 from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.motion import still_motion
 from eslr_jax.pose.retarget import ARM_ABDUCTION
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import FAST
 from eslr_jax.terms.stretch import principal_stretches
-from eslr_jax.types import Body, Scene
 from inverse.search import race
 from inverse.sheet import RESULTS
 
@@ -44,43 +40,31 @@ def band_weights(rest: np.ndarray) -> np.ndarray:
     return np.concatenate([trunk * (1 - sleeve), sleeve], axis=1)
 
 
-def make_scene(body: Body, num_frames: int) -> Scene:
-    """Return the T-shirt as it is cut, on a body that stands still."""
-    scene = prepare_scene(
-        load_garment("tshirt"),
-        pose_body(body, still_motion(body, num_frames, arm_angle=ARM_ABDUCTION)),
-        terms=FAST,
-    )
-    return scene.replace(timestep=jnp.float32(TIMESTEP))
-
-
 def main() -> None:
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 9)
     config = SimConfig(iterations=20 if options.smoke else 100)
-    body = load_body()
-    scene = make_scene(body, frames)
+    body, garment = load_body(), load_garment("tshirt")
+    still = pose_body(body, still_motion(body, frames, arm_angle=ARM_ABDUCTION))
+    scene = prepare_scene(garment, still, terms=FAST).replace(timestep=jnp.float32(TIMESTEP))
     garment = scene.garment
     weights = jnp.asarray(band_weights(np.asarray(garment.rest_positions)), jnp.float32)
     normals = vertex_normals(np.asarray(garment.rest_positions), np.asarray(garment.faces))
     normals = jnp.asarray(normals, jnp.float32)
 
-    def wear(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the shirt on the body [m], and the larger principal stretch of every face."""
+    def loss(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the loss, and the larger principal stretch of every face."""
         ease = TIGHT + UNIT * (weights @ parameters)
         cut = with_rest_positions(garment, garment.rest_positions + ease[:, None] * normals)
         worn = rollout_scene(None, scene.replace(garment=cut), config).positions[-1]
-        return worn, principal_stretches(worn, cut)[0]
-
-    def loss(parameters: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        worn, stretch = wear(parameters)
+        stretch = principal_stretches(worn, cut)[0]
         over = jnp.average(jnp.maximum(stretch - BAR, 0.0) ** 2, weights=garment.rest_areas)
-        return over + PRICE * jnp.sum(parameters**2), (worn, stretch)
+        return over + PRICE * jnp.sum(parameters**2), stretch
 
     start = np.zeros(len(BANDS))
     both, cost, evaluations, by_gradient, simplex = race(loss, start, steps, turns, unit=1e-4)
     shirts = {"tight": start, "lbfgs": by_gradient.best, "nelder_mead": simplex.best}
-    worn = {name: both(jnp.asarray(best, jnp.float32))[1] for name, best in shirts.items()}
+    worn = {name: np.asarray(both(jnp.asarray(best, jnp.float32))[1]) for name, best in shirts.items()}
     areas = np.asarray(garment.rest_areas)
     result = {
         "bar": BAR,
@@ -89,18 +73,15 @@ def main() -> None:
         "evaluations": evaluations,
         "refused": by_gradient.refused,
         "let_out_mm": {name: np.round(1e3 * UNIT * best, 1) for name, best in shirts.items()},
-        "stretch_99": {name: stretch_below(0.99, stretch, areas) for name, (_, stretch) in worn.items()},
-        "area_above_bar": {
-            name: float(np.average(np.asarray(stretch) > BAR, weights=areas))
-            for name, (_, stretch) in worn.items()
-        },
+        "stretch_99": {name: stretch_below(0.99, stretch, areas) for name, stretch in worn.items()},
+        "area_above_bar": {name: np.average(stretch > BAR, weights=areas) for name, stretch in worn.items()},
         "loss_1e-4": {"lbfgs": min(by_gradient.losses), "nelder_mead": min(simplex.losses)},
     }
     keep(options.out / "fit.json", result | environment())
 
 
-def stretch_below(share: float, stretch: jax.Array, areas: np.ndarray) -> float:
+def stretch_below(share: float, stretch: np.ndarray, areas: np.ndarray) -> float:
     """Return the stretch that this share of the cloth's area stays below."""
-    order = np.argsort(np.asarray(stretch))
+    order = np.argsort(stretch)
     covered = np.cumsum(areas[order]) / areas.sum()
-    return float(np.asarray(stretch)[order][np.searchsorted(covered, share)])
+    return float(stretch[order][np.searchsorted(covered, share)])

@@ -1,7 +1,5 @@
 """Search by gradients beside search without, at equal cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -61,18 +59,14 @@ def search_simplex(value: Callable, start: np.ndarray, evaluations: int) -> Sear
     return Search(minimize(record, start, method="Nelder-Mead", options=limits).x, losses)
 
 
-class Race(NamedTuple):
-    """A search by gradients, and one without for as many evaluations as the first took the time of."""
+def race(
+    loss: Callable, start: np.ndarray, steps: int, turns: int, unit: float = 1.0
+) -> tuple[Callable, float, int, Search, Search]:
+    """Search for the least of a loss by gradients, and without in as much time; searches see it in a unit.
 
-    both: Callable  # the loss with what else it returns, compiled
-    cost: float  # evaluations of the loss that a gradient takes the time of
-    evaluations: int
-    by_gradient: Search
-    simplex: Search
-
-
-def race(loss: Callable, start: np.ndarray, steps: int, turns: int, unit: float = 1.0) -> Race:
-    """Search for the least of a loss that returns more besides; searches see it in a unit."""
+    The loss returns more besides. Returned are the loss, compiled; how many evaluations of it a gradient takes
+    the time of; how many the second search had; and both searches.
+    """
     both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
 
     def value_and_grad(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -82,7 +76,7 @@ def race(loss: Callable, start: np.ndarray, steps: int, turns: int, unit: float 
     cost = gradient_cost(both, slope, start, turns)
     evaluations = round(cost * steps)
     simplex = search_simplex(lambda parameters: both(parameters)[0] / unit, start, evaluations)
-    return Race(both, cost, evaluations, descend(value_and_grad, start, steps), simplex)
+    return both, cost, evaluations, descend(value_and_grad, start, steps), simplex
 
 
 def gradient_cost(value: Callable, value_and_grad: Callable, at: np.ndarray, turns: int) -> float:

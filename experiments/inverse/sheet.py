@@ -1,7 +1,5 @@
 """The scene of these experiments: a square sheet in the air."""
 
-from __future__ import annotations
-
 import harness
 import jax
 import jax.numpy as jnp

@@ -7,16 +7,13 @@ which begins with the last state of the first, nothing is pinned. Gradients pass
 is empty: the target is a point. Writes throw.json.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from harness import keep, parser
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.pipeline.report.report import environment
-from eslr_jax.simulation.rollout import rollout_scene
 from inverse.search import race
 from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 

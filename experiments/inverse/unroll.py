@@ -9,8 +9,6 @@ The network simulates a swinging sheet alone, from its own states. Three losses,
 Judged on a longer motion that none has seen. Writes unroll.json.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 
@@ -20,14 +18,12 @@ import numpy as np
 import optax
 from harness import keep, parser
 
-from eslr_jax.config import SimConfig
+from eslr_jax import Network, SimConfig, rollout_scene
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.networks.network import Network
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import Scene
 from inverse.sheet import RESULTS, TIMESTEP, held_scene, square

@@ -2,36 +2,23 @@
 
     python experiments/known_answers [--smoke] [--out DIR] [--part answers rotations peers drape order walk]
 
-Answers: free fall, terminal velocity, energy of a swing, a hanging strip, rigidity of a cantilever and of a
-cylinder, a twisted sheet, a buckled one, a slope, a ball; with both integrators where time matters. Rotations:
-strips that bend far, and a plane that turns. Peers: four answers by Newton's solvers (extra `peers`) and
-Blender's cloth (BLENDER_PYTHON, see peers.py), where they are installed. Drape: Cusick's coefficient of the named
-fabrics. Order: of the integrators, without folds. Walk: millimetres by tolerance, timestep and mesh.
-Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png and
-known_drapes.png.
+Answers: those of `cases.py`, with both integrators where time matters. Rotations: strips that bend far, and a
+plane that turns. Peers: four answers by Newton's solvers (extra `peers`) and Blender's cloth (BLENDER_PYTHON, see
+peers.py), where they are installed. Drape: Cusick's coefficient of the named fabrics. Order: of the integrators,
+without folds. Walk: millimetres by tolerance, timestep and mesh. Writes known_answers.json, part by part, and
+with matplotlib (extra `plot`) known_answers.png, known_rotations.png and known_drapes.png.
 """
-
-from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 PARTS = {  # each with the module and function that yields its rows
-    "answers": ("cases", "answer"), "rotations": ("rotations", "turned"), "peers": ("peers", "compare"),
-    "drape": ("drape", "drapes"), "order": ("order", "orders"), "walk": ("walk", "refine"),
+    "answers": ("cases", "answer"), "rotations": ("rotations", "turned"), "peers": ("cases", "compare"),
+    "drape": ("drape", "drapes"), "order": ("refinement", "orders"), "walk": ("refinement", "refine"),
 }  # fmt: skip
-
-
-def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
-    """Yield a part's rows, each with its drape for the picture or None."""
-    module, name = PARTS[part]
-    for found in getattr(importlib.import_module(f"known_answers.{module}"), name)(is_smoke):
-        row = found[0] if part == "drape" else found
-        yield getattr(row, "as_dict", row._asdict)(), found if part == "drape" else None
 
 
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
@@ -45,7 +32,7 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
         _draw_drapes(drapes, path.with_name("known_drapes.png"))
     if rotations := result.get("rotations"):
         figure, axes = plt.subplots(figsize=(10, 9), layout="constrained")
-        _draw_errors(axes, [_worst(rotations, case) for case in dict.fromkeys(map(_case, rotations))], 5)
+        _draw_errors(axes, _worst(rotations), 5)
         axes.set_title("large rotations, the worst of all loads")
         figure.savefig(path.with_name("known_rotations.png"), dpi=100)
         plt.close(figure)
@@ -63,17 +50,16 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     plt.close(figure)
 
 
-def _case(row: dict[str, Any]) -> tuple[str, str, str]:
-    """Return what a row of rotations is of, whatever its load: case, mesh and unit."""
-    return row["case"].partition(",")[0], row["setting"], row["unit"]
-
-
-def _worst(rows: list[dict[str, Any]], case: tuple[str, str, str]) -> dict[str, Any]:
-    """Return the row of a case that is farthest off."""
-    worst = max(
-        (row for row in rows if _case(row) == case), key=lambda row: abs(row["found"] / row["known"] - 1)
-    )
-    return {**worst, "case": f"{case[0]}, {case[2]}"}
+def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the row that is farthest off of every case, mesh and unit, whatever the load."""
+    worst: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        case = f"{row['case'].partition(',')[0]}, {row['unit']}"
+        error = abs(row["found"] / row["known"] - 1)
+        before = worst.setdefault((case, row["setting"]), {"off": -1.0})
+        if error > before["off"]:
+            before.update(row, case=case, off=error)
+    return list(worst.values())
 
 
 def _draw_drapes(drapes: list, path: Path) -> None:
@@ -130,9 +116,13 @@ def main() -> None:
     drapes: list = []
     for part in arguments.part:
         rows = []
-        for row, drawn in measure(part, arguments.smoke):
+        module, name = PARTS[part]
+        for found in getattr(importlib.import_module(f"known_answers.{module}"), name)(arguments.smoke):
+            if part == "drape":
+                drapes.append(found)
+            answer = found[0] if part == "drape" else found
+            row = getattr(answer, "as_dict", answer._asdict)()
             rows.append(row)
-            drapes += [] if drawn is None else [drawn]
             result = {**result, part: rows, **environment()}
             harness.keep(path, result)
             told = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}

@@ -1,35 +1,36 @@
 """The known answers: each case returns what was found beside what is known."""
 
-from __future__ import annotations
-
+import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import newton_cloth
 import numpy as np
+from blender_cloth import BEST, blender_simulator
 from flax import struct
 from hard_cases import Simulator
 from hard_cases.build import icosphere, make_cloth, make_scene, plane, sheet
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
-from eslr_jax.config import SimConfig
+from eslr_jax import Material, SimConfig, Trajectory, rollout_scene
+from eslr_jax.errors import MissingExtraError
 from eslr_jax.fabric.materials import COTTON, Weave, stretch_stiffness
 from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.pipeline.fabrics import Described, on_threads
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import Air, Term
 from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 from eslr_jax.terms.stretch import stretch_energy
-from eslr_jax.types import Garment, Material, Scene, Trajectory
+from eslr_jax.types import Garment, Scene
 from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
 from known_answers.strip import LENGTH, kept_in, strip
 
 GRAVITY = 9.81  # [m/s^2]
 RIGIDITY = 2e-5  # [N m]
-_ITERATIONS = 60  # of our solver
 
 
 class Answer(NamedTuple):
@@ -168,9 +169,8 @@ def twisted_sheet(is_smoke: bool) -> list[Answer]:
         found = float(bending_energy(jnp.asarray(twisted, jnp.float32), garment, material))
         # At free edges the mixed curvature stays: nothing there can turn it away.
         known = RIGIDITY * twist**2 * float(np.sum(garment.rest_areas))
-        answers.append(
-            Answer("bending energy of a twisted sheet", name, "uJ", 1e6 * found, 1e6 * known, 0.05)
-        )
+        case = "bending energy of a twisted sheet"
+        answers.append(Answer(case, name, "uJ", 1e6 * found, 1e6 * known, 0.05))
     return answers
 
 
@@ -210,12 +210,7 @@ def sphere(simulator: Simulator) -> list[Answer]:
 
 
 def _simulate(simulator: Simulator, scene: Scene) -> Trajectory:
-    """Return what a simulator makes of a scene."""
     return simulator.simulate(simulator.prepare(scene))
-
-
-def _solve(scene: Scene) -> Trajectory:
-    return rollout_scene(None, scene, SimConfig(iterations=_ITERATIONS))
 
 
 @struct.dataclass
@@ -233,12 +228,14 @@ class Brake(Term):
         return 0.5 * self.rate / problem.timestep * problem.masses * dot3(moved, moved)
 
 
-OURS = tuple(Simulator(name, _solve, integrator=name) for name in ("euler", "bdf2"))
+_SOLVE = partial(rollout_scene, None, config=SimConfig(iterations=60))
+OURS = tuple(Simulator(name, _SOLVE, integrator=name) for name in ("euler", "bdf2"))
 STATIC: tuple[Callable[[bool], list[Answer]], ...] = (rigidity, twisted_sheet)
 MOVING: tuple[Callable[[Simulator], list[Answer]], ...] = (
     free_fall, terminal_velocity, swing, hanging_strip, buckling, slope, sphere,
 )  # fmt: skip
 FOR_PEERS = (free_fall, swing, hanging_strip, slope)  # the others have air, a brake or our energies
+_SLOPES = (35.0, 60.0)  # [degrees], of the peers
 
 
 def answer(is_smoke: bool) -> Iterator[Answer]:
@@ -248,3 +245,23 @@ def answer(is_smoke: bool) -> Iterator[Answer]:
     for case in MOVING:
         for simulator in OURS[:1] if is_smoke else OURS:  # the others run the same code
             yield from case(simulator)
+
+
+def peers() -> Iterator[Simulator]:
+    for setting in newton_cloth.BEST:
+        effort = f" {setting.substeps}x{setting.iterations}" if setting.substeps else ""
+        try:
+            yield dataclasses.replace(newton_cloth.newton_simulator(setting), name=setting.name + effort)
+        except MissingExtraError as error:
+            print(f"left out: {error}")
+            break
+    try:
+        yield dataclasses.replace(blender_simulator(BEST), name="Blender {}x{}".format(*BEST))
+    except MissingExtraError as error:
+        print(f"left out: {error}")
+
+
+def compare(is_smoke: bool) -> Iterator[Answer]:
+    for simulator in peers():
+        for case in FOR_PEERS[:1] if is_smoke else FOR_PEERS:
+            yield from slope(simulator, _SLOPES) if case is slope else case(simulator)

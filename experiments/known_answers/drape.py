@@ -1,7 +1,5 @@
 """Cusick's drape coefficient of named fabrics, in the median of starts that differ by rounding, and by mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -38,7 +36,6 @@ class Drape(NamedTuple):
 
 
 def drapes(is_smoke: bool) -> Iterator[tuple[Drape, Hung]]:
-    """Yield how fabrics drape, each with a disc for the picture."""
     if is_smoke:
         yield drape("satin-woven", starts=1, spacing=0.03, frames=6)
         return

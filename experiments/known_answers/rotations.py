@@ -7,8 +7,6 @@ Bisshopp and Drucker 1945, doi 10.1090/qam/13360 (a load at the end); Love 1927,
 Theory of Elasticity, section 263 (a column).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import jax
@@ -17,7 +15,7 @@ import numpy as np
 import scipy.linalg
 from hard_cases import Simulator
 from hard_cases.build import make_cloth, make_scene, plane, sheet
-from scipy.integrate import solve_bvp
+from scipy.integrate import cumulative_trapezoid, solve_bvp
 from scipy.special import ellipe, ellipk
 
 from eslr_jax.fabric.materials import COTTON, stretch_stiffness
@@ -42,12 +40,9 @@ Curve = Callable[[np.ndarray], np.ndarray]  # places along and up by arc, in len
 def elastica(weight: float, load: float, along: float = 0.0) -> Curve:
     """Return the shape of a clamped beam: places along and up by the arc from its clamp, in lengths.
 
-    With t the angle above the level and s the arc: t'' = (G (1 - s) + a) cos t + b sin t.
-
-    Args:
-        weight: G, its weight per length times L^3 over its rigidity.
-        load: a, a load downwards at its end times L^2 over its rigidity.
-        along: b, such a load along x; a column has a negative one.
+    With t the angle above the level and s the arc: t'' = (G (1 - s) + a) cos t + b sin t. G is the weight per
+    length times L^3 over the rigidity, a a load downwards at the end times L^2 over the rigidity, and b such a
+    load along x; a column has a negative one.
     """
     arc = np.linspace(0, 1, 201)
     state = np.stack([0.5 * np.pi * arc, np.full(201, 0.5 * np.pi)]) if along else np.zeros((2, 201))
@@ -62,21 +57,15 @@ def elastica(weight: float, load: float, along: float = 0.0) -> Curve:
         arc, state = found.x, found.y
     arc = np.linspace(0, 1, 20_001)
     angle = found.sol(arc)[0]
-    steps = np.stack([np.cos(angle), np.sin(angle)])
-    places = np.concatenate(
-        [np.zeros((2, 1)), np.cumsum(steps[:, 1:] + steps[:, :-1], axis=1) / 40_000], axis=1
-    )
+    places = cumulative_trapezoid(np.stack([np.cos(angle), np.sin(angle)]), arc, initial=0)
     return lambda s: np.stack([np.interp(s, arc, place) for place in places])
 
 
 def column(tilt: float) -> tuple[float, float, float]:
-    """Return the load P L^2 / D that tilts the end of a column, and how far along and aside the end then is.
+    """Return the load P L^2 / D that tilts the end of a column [rad], and how far along and aside it then is.
 
     With k = sin(tilt / 2) and K, E the complete elliptic integrals: K^2, 2 E / K - 1 and 2 k / K, in lengths. It
     begins to buckle at pi^2 / 4.
-
-    Args:
-        tilt: [rad].
     """
     k = np.sin(tilt / 2)
     bent = ellipk(k * k)
@@ -106,17 +95,9 @@ def strip(mesh: str, spacing: float) -> tuple[Garment, float, np.ndarray]:
 
 
 def bend(mesh: str, spacing: float, curve: Curve, *, weight: float = 0.0, load=(0.0, 0.0)) -> np.ndarray:
-    """Return where the end of a strip is at rest, along and up, in lengths.
+    """Return where the end of a `strip` is at rest, along and up, in lengths; the search starts from a curve.
 
-    Args:
-        mesh: Of `strip`.
-        spacing: Likewise [m].
-        curve: Where to start from.
-        weight: rho g L^3 / D.
-        load: P L^2 / D along x and up.
-
-    Raises:
-        RuntimeError: No minimum was found.
+    The weight is rho g L^3 / D, the load P L^2 / D along x and up.
     """
     garment, length, share = strip(mesh, spacing)
     width = EDGES_ACROSS * spacing

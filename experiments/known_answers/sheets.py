@@ -1,7 +1,5 @@
 """Flat sheets of any mesh in the plane y = 0, what they are rolled to, and how stiff a strip of them is."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.optimize
 import scipy.sparse

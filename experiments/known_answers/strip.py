@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from hard_cases.build import make_cloth, make_scene, same_way_faces
 
-from eslr_jax import SimConfig
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.simulation.scene import start_integrator
 
 LENGTH = 0.5  # [m]

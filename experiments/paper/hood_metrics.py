@@ -1,7 +1,5 @@
 """HOOD's six terms over a trajectory."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

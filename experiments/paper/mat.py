@@ -5,16 +5,12 @@
 It keeps faces as tokens with the published features of two frames, one token for the whole, heads that average
 along geodesics, the change of every face's frame as output, the Poisson solve that joins faces, and the
 least-squares step off the body; supervised, one frame at a time, with noise on its inputs. It lacks seven eighths
-of the width (64 instead of 512), half the layers, half of every feed-forward part (it is twice as wide as a token
-instead of four times), the root of the width by which encoded inputs are scaled, attention by softmax (linear
-attention takes a tenth of the time), the turn of the nearest body face about its normal, and singular values; the
-Laplacian of the step off the body is the rest mesh's. All it sees is turned to the garment's own heading. It is
-trained on one garment.
-
+of the width, half the layers and of the feed-forward parts' width, the scale of encoded inputs, attention by
+softmax (linear attention takes a tenth of the time), the turn of the nearest body face about its normal, and
+singular values; the Laplacian of the step off the body is the rest mesh's. All it sees is turned to the garment's
+heading.
 Source: Li et al. 2024 (MAT), whose published run names no flags; weights of losses are ours.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import time
@@ -70,7 +66,7 @@ class Weights:
     seen_deviation: Seen
     change_mean: Change
     change_deviation: Change
-    space: Space | None = None
+    space: Any = None  # a `Space`, where the network is applied
 
 
 class Transformer(nn.Module):
@@ -110,7 +106,6 @@ class Mat(System):
 
     def apply(self, params: Weights, problem: FrameProblem, state: ClothState, /) -> Any:
         """Return positions at t + 1 [m]."""
-        assert params.space is not None
         contacts = problem.data_of(Collision).nearest
         turn = heading(state.position, params.space)
         step = problem.timestep * state.velocity
@@ -129,12 +124,9 @@ def observe(
     """Return what the network is told of positions at t, of the step since t - 1 [m] and of contacts."""
     garment = space.garment
     # Rows of vectors are turned back by a product from the right.
-    arrows = (
-        contacts.next_points - contacts.points,
-        contacts.normals,
-        contacts.next_normals - contacts.normals,
-    )
-    x, moved, body, normals, turned = (rows @ turn for rows in (position, step, *arrows))
+    drift, swing = contacts.next_points - contacts.points, contacts.next_normals - contacts.normals
+    arrows = (position, step, drift, contacts.normals, swing)
+    x, moved, body, normals, turned = (rows @ turn for rows in arrows)
     is_real = garment.vertex_mask[:, None]
     now, before = (face_frames(y, garment) @ space.inverse_frames for y in (x, x - moved))
     distance = jnp.clip(contacts.distances, -CONTACT_RADIUS, CONTACT_RADIUS)[:, None]
@@ -149,10 +141,8 @@ def observe(
 
 def predict(network: Weights, seen: Seen) -> Change:
     """Return the change of a frame."""
-    assert network.space is not None
     scaled = standardise(seen, network.seen_mean, network.seen_deviation)
-    mask = (network.space.garment.rest_areas > 0).astype(jnp.float32)
-    change = Transformer().apply(network.params, scaled, network.space.geodesic, mask)
+    change = Transformer().apply(network.params, scaled, network.space.geodesic, network.space.face_mask)
     return jax.tree.map(
         lambda x, mean, deviation: mean + deviation * x, change, network.change_mean, network.change_deviation
     )
@@ -165,12 +155,10 @@ def standardise(values: Any, mean: Any, deviation: Any) -> Any:
 
 def loss(network: Weights, seen: Seen, change: Change, key: Array) -> Float[Array, ""]:
     """Return the mean error of a frame in standard deviations; both arguments are standardised."""
-    assert network.space is not None
     keys = jax.random.split(key)
     noisy = Seen(*(x + _NOISE * jax.random.normal(k, x.shape) for x, k in zip(seen, keys, strict=True)))
-    mask = (network.space.garment.rest_areas > 0).astype(jnp.float32)
-    found = Transformer().apply(network.params, noisy, network.space.geodesic, mask)
-    assert isinstance(found, Change)
+    mask = network.space.face_mask
+    found: Any = Transformer().apply(network.params, noisy, network.space.geodesic, mask)
     of_faces = jnp.mean(jnp.abs(found.faces - change.faces), axis=0, where=mask[:, None] > 0)
     return jnp.mean(of_faces) + jnp.mean(jnp.abs(found.whole - change.whole))
 
@@ -200,14 +188,10 @@ def train(truth: Truth, steps: int, seed: int = 0) -> tuple[Weights, dict[str, A
         for positions, worn in zip(truth.positions, truth.worn, strict=True)
     ]
     seen, change = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
-    is_face = np.asarray(space.garment.rest_areas) > 0
-    moments = [column_moments(values, is_face) for values in (seen, change)]
-    seen, change = (
-        jax.tree.map(lambda x, m, d: (x - m) / d, values, *moment)
-        for values, moment in zip((seen, change), moments, strict=True)
-    )
+    moments = [column_moments(values, np.asarray(space.face_mask) > 0) for values in (seen, change)]
+    seen, change = standardise(seen, *moments[0]), standardise(change, *moments[1])
     first = jax.tree.map(lambda x: x[0], seen)
-    params = Transformer().init(jax.random.key(seed), first, space.geodesic, is_face.astype(np.float32))
+    params = Transformer().init(jax.random.key(seed), first, space.geodesic, space.face_mask)
     network = Weights(params, *moments[0], *moments[1], space)
     draw = np.random.default_rng(seed)
 
@@ -266,6 +250,4 @@ def main() -> None:
     chosen = options(__doc__, 2000).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, 2 if chosen.smoke else chosen.steps, chosen.seed)
-    path = chosen.out / f"mat_{chosen.garment}.npz"
-    write_network(network, path, training)
-    print(path, training)
+    write_network(network, chosen.out / f"mat_{chosen.garment}.npz", training)

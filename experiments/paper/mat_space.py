@@ -1,7 +1,5 @@
 """What MAT computes on a garment's rest mesh: faces to their changes and back, and the step off the body."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
@@ -33,6 +31,11 @@ class Space:
     laplacian: Float[Array, "vertices vertices"]
     smooth_inverse: Float[Array, "vertices vertices"]  # of the step off the body, were no vertex inside
 
+    @property
+    def face_mask(self) -> Float[Array, " faces"]:
+        """One for real faces, zero for padding."""
+        return (self.garment.rest_areas > 0).astype(jnp.float32)
+
 
 class Change(NamedTuple):
     """What a frame does to the cloth, in the garment's heading."""
@@ -48,14 +51,12 @@ def prepare_space(garment: Garment) -> Space:
     count, real = is_vertex.sum(), faces[is_face]
     frames = np.broadcast_to(np.eye(3), (len(faces), 3, 3)).copy()
     frames[is_face] = np.asarray(face_frames(garment.rest_positions, garment))[is_face]
-    cotangents = np.zeros((len(faces), 3))
+    cotangents, laplacian = np.zeros((len(faces), 3)), np.zeros((len(positions), len(positions)))
     for k in range(3):
-        tip = positions[real[:, (k + 2) % 3]]
-        a, b = positions[real[:, k]] - tip, positions[real[:, (k + 1) % 3]] - tip
-        cotangents[is_face, k] = 0.5 * np.sum(a * b, axis=1) / np.linalg.norm(np.cross(a, b), axis=1)
-    laplacian = np.zeros((len(positions), len(positions)))
-    for k in range(3):
-        i, j, w = real[:, k], real[:, (k + 1) % 3], cotangents[is_face, k]
+        i, j, tip = np.roll(real, -k, axis=1).T
+        a, b = positions[i] - positions[tip], positions[j] - positions[tip]
+        w = 0.5 * np.sum(a * b, axis=1) / np.linalg.norm(np.cross(a, b), axis=1)
+        cotangents[is_face, k] = w
         for row, column, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             np.add.at(laplacian, (row, column), sign * w)
     away = geodesic_distances(geodesic_graph(positions[:count], real), np.arange(count))
@@ -65,14 +66,8 @@ def prepare_space(garment: Garment) -> Space:
     near = np.exp(-(corners @ away @ corners.T) / _GEODESIC_REACH)
     geodesic[np.ix_(is_face, is_face)] = near / near.sum(axis=1, keepdims=True)
     smooth = _SMOOTH * laplacian.T @ laplacian + _STAY * np.eye(len(positions))
-    tables = (
-        np.linalg.inv(frames),
-        cotangents,
-        geodesic,
-        np.linalg.pinv(laplacian, hermitian=True),
-        laplacian,
-        np.linalg.inv(smooth),
-    )
+    poisson = np.linalg.pinv(laplacian, hermitian=True)
+    tables = (np.linalg.inv(frames), cotangents, geodesic, poisson, laplacian, np.linalg.inv(smooth))
     return Space(garment, *(jnp.asarray(table, jnp.float32) for table in tables))
 
 

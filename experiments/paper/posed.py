@@ -13,11 +13,8 @@ They predict displacements of the rest mesh, which the skin weights then carry a
   2023), of which neither code nor text was found.
 
 All read rotations relative to the root instead of SMPL's axis-angles, and no body shape.
-
 Source: Bertiche et al. 2021 (PBNS); Santesteban et al. 2022 (SNUG); Chen et al. 2024 (GAPS).
 """
-
-from __future__ import annotations
 
 import dataclasses
 import time
@@ -120,13 +117,9 @@ def displace(
 ) -> Float[Array, "frames vertices 3"]:
     """Return the garment's positions on a moving body [m], shape [frames, vertices, 3]; cotton."""
     features = _inputs(network, garment, transforms, COTTON)
-    count = (
-        network.params["params"]["Dense_0" if network.system != "pbns" else "Dense_4"]["kernel"].shape[1] // 3
-    )
-    module = Displacements(network.system, count)
-    offsets = module.apply(network.params, features[None], jnp.zeros((4, 1, 256)))[0]
-    missing = garment.rest_positions.shape[0] - count
-    return carry(garment, jnp.pad(offsets, ((0, 0), (0, missing), (0, 0))), transforms)
+    last = network.params["params"]["Dense_4" if network.system == "pbns" else "Dense_0"]
+    module = Displacements(network.system, last["kernel"].shape[1] // 3)
+    return carry(garment, module.apply(network.params, features[None], jnp.zeros((4, 1, 256)))[0], transforms)
 
 
 def carry(
@@ -134,7 +127,9 @@ def carry(
     offsets: Float[Array, "frames vertices 3"],
     transforms: Float[Array, "frames joints 3 4"],
 ) -> Float[Array, "frames vertices 3"]:
-    """Return the displaced rest mesh skinned to every frame [m], shape [frames, vertices, 3]."""
+    """Return the displaced rest mesh skinned to every frame [m]; padded vertices are not displaced."""
+    missing = garment.rest_positions.shape[0] - offsets.shape[1]
+    offsets = jnp.pad(offsets, ((0, 0), (0, missing), (0, 0)))
 
     def one(frame: tuple[Array, Array]) -> Array:
         offset, posed = frame
@@ -273,6 +268,4 @@ def main() -> None:
         "core_hours": (time.process_time() - began) / 3600,
         "final_loss_j": float(np.mean(losses[-100:])) * _UNIT,
     }
-    path = chosen.out / f"{chosen.system}_{chosen.garment}.npz"
-    write_network(network, path, training)
-    print(path, training)
+    write_network(network, chosen.out / f"{chosen.system}_{chosen.garment}.npz", training)

@@ -7,8 +7,6 @@ ARCSim. A name is one of `rollouts.read_system`. Writes qualitative.png (cloth),
 area on cloth, one scale for all), stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import harness
@@ -51,16 +49,13 @@ def face_energies(positions: Float[Array, "frames vertices 3"], scene: Scene) ->
 
 def at_vertices(energies: np.ndarray, scene: Scene) -> np.ndarray:
     """Return the mean over a vertex' faces, weighted by area."""
-    faces, areas = np.asarray(scene.garment.faces), np.asarray(scene.garment.rest_areas)
-    total, weight = np.zeros((2, len(scene.garment.rest_positions)))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], areas * energies)
-        np.add.at(weight, faces[:, corner], areas)
+    corners, areas = np.asarray(scene.garment.faces).ravel(), np.asarray(scene.garment.rest_areas)
+    count = len(scene.garment.rest_positions)
+    total, weight = (np.bincount(corners, x.repeat(3), count) for x in (areas * energies, areas))
     return total / np.maximum(weight, 1e-12)
 
 
 def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
-    """Draw the share of faces that hold more than an energy per area."""
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(6.4, 3.6))
@@ -133,6 +128,6 @@ def main() -> None:
         }
         for name, values in joined.items()
     }
-    sizes = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
-    result = {**sizes, "mean": rows, "environment": environment()}
+    result = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
+    result |= {"mean": rows, "environment": environment()}
     harness.keep(chosen.out / "stretch_energy.json", result)

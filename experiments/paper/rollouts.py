@@ -1,7 +1,5 @@
 """Systems by name, and free rollouts measured by HOOD's six terms and their Total, as in the paper's tables."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,8 +10,7 @@ import harness
 import jax
 import numpy as np
 
-from eslr_jax.config import SimConfig
-from eslr_jax.networks.network import Network
+from eslr_jax import Network, SimConfig, Trajectory, rollout_scene
 from eslr_jax.pipeline.assets.budget import SOLVER
 from eslr_jax.pipeline.assets.models import model_record
 from eslr_jax.pipeline.report.calibrate import simulator_of
@@ -28,9 +25,8 @@ from eslr_jax.pipeline.report.gap import OptimalityGap, stepped_potentials, traj
 from eslr_jax.pipeline.report.metrics import extremes, measure_frames
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.simulation.batch import simulate_scenes
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.hood import HoodParameters
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Scene
 from paper import mat, posed, ssch
 from paper.hood_metrics import hood_metrics
 from paper.mat_space import prepare_space
@@ -61,12 +57,11 @@ class System(NamedTuple):
 def read_system(name: str) -> System:
     """Return the system of a name.
 
-    Args:
-        name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
-            NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
-            CHANGE is a control of `pipeline.report.evaluate` or another mode of the geodesic embedding.
-            SYSTEM@FOLDER is one of `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there.
-            Their control is `SKINNED`, the garment carried by the joints; mat's is "mat@FOLDER~untrained".
+    It is `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
+    NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it. CHANGE is a
+    control of `pipeline.report.evaluate` or another mode of the geodesic embedding. SYSTEM@FOLDER is one of
+    `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there. Their control is `SKINNED`, the
+    garment carried by the joints; mat's is "mat@FOLDER~untrained".
     """
     if name == SKINNED:
         return _replayed(lambda worn: skin_garment(worn.scene.garment, worn.poses.joint_transforms), {})
@@ -115,11 +110,10 @@ def _read_trained(kind: str, folder: str) -> System:
         return reader.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")[0]
 
     if kind != "mat":
-
-        def positions(worn: Worn) -> Any:
-            return reader.displace(weights_of(worn), worn.scene.garment, worn.poses.joint_transforms)
-
-        return _replayed(positions, cost)
+        return _replayed(
+            lambda worn: reader.displace(weights_of(worn), worn.scene.garment, worn.poses.joint_transforms),
+            cost,
+        )
 
     def stepper_of(worn: Worn) -> Network:
         weights = weights_of(worn)
@@ -169,11 +163,7 @@ def roll(system: System, setting: Setting) -> list[tuple[Worn, Network | None, T
 
 
 def find_references(setting: Setting) -> list[Reference]:
-    """Return the near-optimal rollout of every scene, and the optima from its states.
-
-    Raises:
-        NonFiniteError: One of them is not finite.
-    """
+    """Return the near-optimal rollout of every scene, checked to be finite, and the optima from its states."""
     system = read_system(OPTIMUM)
     found = []
     for worn, _, trajectory in roll(system, setting):

@@ -7,14 +7,10 @@ off the body at rest, and GRUs that turn the body's motion into latents; supervi
 the solver's. It lacks the diffused body model (the garment's own skin weights hold, and simulated cloth is
 unposed vertex by vertex), the body's shape, the learned pose code (ten principal components stand for it) and
 half to three quarters of the width. The body at rest is its mesh, not a learned distance.
-
 Source: Santesteban et al. 2021 (SSCH), whose loss weights were not published; ours are.
 """
 
-from __future__ import annotations
-
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +21,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from eslr_jax import load_body, load_garment
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.pipeline.assets import load_body, load_garment
 from eslr_jax.pose import lbs
 from eslr_jax.terms.collision import penetration
 from eslr_jax.types import BodySurface, Garment
@@ -139,8 +135,7 @@ def unpose(
 
 def _encode(params: Any, scaled: Float[Array, "shapes vertices 3"]) -> tuple[Array, Array]:
     """Return mean and logarithmic variance of latents, both of shape [shapes, 25]."""
-    found = Encoder().apply(params, scaled.reshape((len(scaled), -1)))
-    assert isinstance(found, tuple)
+    found: Any = Encoder().apply(params, scaled.reshape((len(scaled), -1)))
     return found
 
 
@@ -154,12 +149,11 @@ def standardise(
 def decode(network: Ssch, latents: Float[Array, "*batch latents"]) -> Float[Array, "*batch vertices 3"]:
     """Return offsets of the rest mesh [m]."""
     shape = network.offset_mean.shape
-    scaled = Decoder(shape[0] * 3).apply(network.params["decoder"], latents)
-    assert isinstance(scaled, jax.Array)
+    scaled: Any = Decoder(shape[0] * 3).apply(network.params["decoder"], latents)
     scaled = scaled.reshape((*latents.shape[:-1], *shape))
-    return jnp.broadcast_to(network.offset_mean, scaled.shape) + scaled * jnp.broadcast_to(
-        network.offset_deviation, scaled.shape
-    )
+    scales = network.offset_mean, network.offset_deviation
+    mean, deviation = (jnp.broadcast_to(x, scaled.shape) for x in scales)
+    return mean + scaled * deviation
 
 
 def displace(
@@ -167,36 +161,38 @@ def displace(
 ) -> Float[Array, "frames vertices 3"]:
     """Return the garment's positions on a moving body [m]; padded vertices stay in place."""
     features = motion_features(transforms, network)
-    latents = Regressor().apply(network.params["regressor"], features[None])
-    assert isinstance(latents, jax.Array)
-    offsets = decode(network, latents[0])
-    missing = garment.rest_positions.shape[0] - offsets.shape[1]
-    return carry(garment, jnp.pad(offsets, ((0, 0), (0, missing), (0, 0))), transforms)
-
-
-@struct.dataclass
-class RestScene:
-    """The garment and the body at rest, on which shapes are judged."""
-
-    garment: Garment
-    surface: BodySurface
-    body: Float[Array, "surface_vertices 3"]  # [m]
+    latents: Any = Regressor().apply(network.params["regressor"], features[None])
+    return carry(garment, decode(network, latents[0]), transforms)
 
 
 def shape_loss(
-    params: Any, network: Ssch, offsets: Float[Array, "shapes vertices 3"], rest: RestScene, key: Array
+    params: Any,
+    network: Ssch,
+    offsets: Float[Array, "shapes vertices 3"],
+    rest: tuple[Garment, BodySurface, Float[Array, "surface_vertices 3"]],
+    key: Array,
 ) -> Float[Array, ""]:
-    """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm]."""
+    """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm].
+
+    Shapes are judged at rest: `rest` has the garment, and the body's surface and places [m].
+    """
+    garment, surface, body = rest
+
+    def depth_of(offsets: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
+        position = garment.rest_positions + offsets
+        found = find_contacts(position, body, body, surface, garment.vertex_blocks)
+        return penetration(position, jax.lax.stop_gradient(found), _CLEARANCE)
+
     network = network.replace(params=params)
     scaled = standardise(offsets, network)
     mean, spread = _encode(params["encoder"], scaled)
     keys = jax.random.split(key)
     decoded = decode(network, mean + jnp.exp(0.5 * spread) * jax.random.normal(keys[0], mean.shape))
     drawn = decode(network, jax.random.normal(keys[1], (_COLLIDING, _LATENTS)))
-    depth = jax.lax.map(partial(_depth, rest), jnp.concatenate([decoded[:_COLLIDING], drawn]))
+    depth = jax.lax.map(depth_of, jnp.concatenate([decoded[:_COLLIDING], drawn]))
     error = decoded - offsets
     divergence = 0.5 * jnp.mean(jnp.sum(jnp.exp(spread) + mean**2 - 1.0 - spread, axis=1))
-    bumps = _bumps(error, rest.garment)
+    bumps = _bumps(error, garment)
     return 100.0 * (jnp.mean(jnp.abs(error)) + jnp.mean(jnp.abs(bumps)) + jnp.mean(depth)) + (
         _DIVERGENCE * divergence
     )
@@ -209,15 +205,6 @@ def _bumps(x: Float[Array, "shapes vertices 3"], garment: Garment) -> Float[Arra
     return x - around / jnp.maximum(jnp.sum(mask, axis=2, dtype=x.dtype), 1.0)
 
 
-def _depth(rest: RestScene, offsets: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
-    """Return by how much the clearance from the body at rest is missed [m]."""
-    position = rest.garment.rest_positions + offsets
-    found = jax.lax.stop_gradient(
-        find_contacts(position, rest.body, rest.body, rest.surface, rest.garment.vertex_blocks)
-    )
-    return penetration(position, found, _CLEARANCE)
-
-
 def motion_loss(
     params: Any,
     network: Ssch,
@@ -226,8 +213,7 @@ def motion_loss(
     latents: Float[Array, "sequences frames latents"],
 ) -> Float[Array, ""]:
     """Return the regressor's loss: errors of the decoded cloth [cm] and of the latents."""
-    found = Regressor().apply(params, features)
-    assert isinstance(found, jax.Array)
+    found: Any = Regressor().apply(params, features)
     error = decode(network, found) - offsets
     return 100.0 * jnp.mean(jnp.abs(error)) + _MATCH * jnp.mean(jnp.abs(found - latents))
 
@@ -260,11 +246,9 @@ def prepare(
 def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, dict[str, Any]]:
     """Train auto-encoder and regressor on a garment's rollouts; return the network and how it was trained."""
     began = time.process_time()
-    garment, body = load_garment(truth.worn[0].garment), load_body()
-    scene_body = truth.worn[0].scene.body
-    assert scene_body is not None
-    surface = scene_body.surface
-    rest = RestScene(garment, surface, jnp.asarray(body.rest_positions)[surface.vertex_ids])
+    garment, body = load_garment(truth.worn[0].garment), truth.worn[0].scene.body
+    assert body is not None
+    rest = garment, body.surface, jnp.asarray(load_body().rest_positions)[body.surface.vertex_ids]
     count = garment.rest_positions.shape[0]
     transforms = jnp.stack([worn.poses.joint_transforms for worn in truth.worn])
     positions = jnp.asarray(truth.positions[:, :, :count])
@@ -328,6 +312,4 @@ def main() -> None:
     chosen = options(__doc__, (2000, 400), nargs=2, metavar=("SHAPE", "MOTION")).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, (2, 2) if chosen.smoke else tuple(chosen.steps), chosen.seed)
-    path = chosen.out / f"ssch_{chosen.garment}.npz"
-    write_network(network, path, training)
-    print(path, training)
+    write_network(network, chosen.out / f"ssch_{chosen.garment}.npz", training)

@@ -1,7 +1,5 @@
 """What trained systems share: the loop, and the supervised ones' ground truth, rollouts of the training clips."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -17,10 +15,9 @@ import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.files.npz import read_arrays, write_arrays
 from eslr_jax.pipeline.assets import split_clips
-from eslr_jax.simulation.rollout import rollout_scene
 from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 _FRAMES = 100  # of a clip, as in the tables
@@ -45,12 +42,7 @@ class Truth(NamedTuple):
 
 
 def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
-    """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`.
-
-    Raises:
-        ValueError: The folder holds rollouts of other clips or lengths.
-        NonFiniteError: A rollout is not finite.
-    """
+    """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`."""
     clips, frames = tuple(split_clips("train")), _FRAMES
     if is_smoke:
         clips, frames = clips[:1], 5
@@ -67,7 +59,6 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
             found.append(np.asarray(trajectory.positions))
             print(f"truth {len(found)} of {len(clips)} {time.process_time() - began:.0f} s", flush=True)
         hours = (time.process_time() - began) / 3600
-        folder.mkdir(parents=True, exist_ok=True)
         arrays = {"positions": np.stack(found), "clips": np.array(clips), "core_hours": np.array(hours)}
         write_arrays(path, arrays)
     kept = read_arrays(path, content="ground truth")
@@ -77,11 +68,11 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
 
 
 def write_archive(path: Path, arrays: dict[str, Any], record: dict[str, Any]) -> None:
-    """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON; say so."""
     leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(arrays).items()}
     write_arrays(path, leaves, is_compressed=True)
     path.with_suffix(".json").write_text(json.dumps(record, indent=1))
+    print(path, record["training"])
 
 
 def read_archive(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -4,23 +4,18 @@
         [--models LABEL=NAME,NAME ...] [--controls] [--anew] [--clips NAME ...] [--frames 100] [--smoke]
 
 native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
-seen, with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a
-Mixamo character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them.
-model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks;
-and the Total of Table I where that was measured at the same size.
+seen, with other modes of the geodesic embedding. new_motion (IV): every third clip of DeepMimic, where the paper
+takes a Mixamo character. model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also
+of the full-size networks; and the Total of Table I where that was measured at the same size.
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
-bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the
-gap, from the optimum's states and from its own, and the energies of free rollouts; a second row says it of the
-same network untrained.
+bundled network or an exported file, see `rollouts.read_system`. A second row is of the same network untrained.
 --controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
 
 A table is never written over one of another setting, nor a row that names its networks over one of others: give
 another --out or label. A row that a table has is kept, and not measured again. Rows are written one by one, each
 with the versions and the device that made it, so that several runs can fill a table.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -207,9 +202,7 @@ def training_cost(names: Sequence[str]) -> dict[str, float]:
 def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
     """Return the parts of a table that was written before, row by row; empty ones where there is none.
 
-    Raises:
-        SystemExit: It is of other garments, clips, frames or vertices and may not be written over. Says which
-            differ, and what to give.
+    One of other garments, clips, frames or vertices may not be written over: SystemExit says which differ.
     """
     found = harness.kept(file)
     parts = {name: found.get(name, {}) for name in PARTS}
@@ -225,11 +218,7 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
 
 
 def check_networks(file: Path, rows: Rows, kept: dict[str, list[str]]) -> None:
-    """Refuse to take a row that the table has for one of other networks.
-
-    Raises:
-        SystemExit: Names the row and its networks.
-    """
+    """Refuse to take a row that the table has for one of other networks: SystemExit names both."""
     for label, names in rows.items():
         if label in kept and kept[label] != [short_name(name) for name in names]:
             own = ", ".join(kept[label])
@@ -251,11 +240,7 @@ def full_size(vertices: str, is_smoke: bool) -> tuple[str, ...]:
 
 
 def check_costs(file: Path, names: Sequence[str]) -> None:
-    """Refuse to write over a table with rows that would be lost: times compare only within a run.
-
-    Raises:
-        SystemExit: Names them.
-    """
+    """Refuse to write over a table with rows that would be lost, as times compare only within a run."""
     found = harness.kept(file).get("mean", {})
     if lost := [name for name in found if name not in names]:
         raise SystemExit(f"{file} has rows for {', '.join(lost)}; measure them too, or give another --out")
@@ -277,23 +262,18 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
     for label, system in systems.items():
-        scene = prepare_scene(
-            load_garment("tshirt", vertices=vertices, **system.garment_options),
-            poses,
-            terms=FAST,
-        )  # type: ignore[arg-type]
+        garment = load_garment("tshirt", vertices=vertices, **system.garment_options)  # type: ignore[arg-type]
+        scene = prepare_scene(garment, poses, terms=FAST)
         inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
         def forward(network, state, config=system.config, scene=scene, inputs=inputs):
             return make_stepper(network, config)(frame_problem(scene, state, inputs), state)[0].position
 
-        memory = jax.jit(forward).lower(system.network, scene.initial_state).compile().memory_analysis()
-        assert memory is not None
-        parts[label] = (forward, (system.network, scene.initial_state))
-        found[label] = {
-            **system.cost,
-            "memory_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
-        }
+        arguments = system.network, scene.initial_state
+        memory: Any = jax.jit(forward).lower(*arguments).compile().memory_analysis()
+        parts[label] = (forward, arguments)
+        size = memory.temp_size_in_bytes + memory.argument_size_in_bytes
+        found[label] = {**system.cost, "memory_mb": size / 1e6}
         if system.network is not None:
             config = system.network.config
             layers = next(getattr(config, name) for name in _LAYERS if hasattr(config, name))

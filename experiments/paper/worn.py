@@ -1,7 +1,5 @@
 """Garments on clips: what the tables measure on, and what supervised systems learn from."""
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 
@@ -49,11 +47,7 @@ def not_finite(trajectory: Trajectory) -> float:
 
 
 def check_optimum(trajectory: Trajectory, garment: str) -> None:
-    """Check a rollout that others are compared with.
-
-    Raises:
-        NonFiniteError: Something was not finite; names garment and frame.
-    """
+    """Raise NonFiniteError, with garment and frame, if a rollout that others are compared with is not finite."""
     if not_finite(trajectory):
         frame = int(trajectory.first_bad_frame)
         raise NonFiniteError(
