@@ -70,7 +70,9 @@ def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
 
 @pytest.mark.slow
 def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_table(folder, carried, tshirt):
-    from peers import SCORE, describe_rollout, example_scene
+    from peers import SCORE, describe_rollout
+
+    from eslr_jax.pipeline.report.calibrate import example_scene
 
     np.savez(folder / "carried.npz", positions=carried, faces=np.asarray(tshirt.faces))
     done = succeeded(eslr("score", folder / "carried.npz", "--motion", "cmu_016_32"))
@@ -78,7 +80,7 @@ def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_ta
     assert "the garment stays where it was put on" in done.stdout
     score = scored(folder / "carried.npz")
     assert score["gap_relative_median"] > 0.1
-    row = describe_rollout(carried, example_scene("tshirt_1k", 8), every=2)
+    row = describe_rollout(carried, example_scene("tshirt", "1k", "cmu_016_32", 8), every=2)
     for name, column in SCORE.items():  # as in the table of peers
         assert score[name] == pytest.approx(row[column], rel=5e-3, abs=1e-6), name
 

@@ -53,6 +53,7 @@ def test_cloth_that_starts_inside_the_body_comes_out_of_it(depth):
     assert float(principal_stretches(trajectory.positions[-1], scene.garment)[0].max()) < 1.2
 
 
+@pytest.mark.slow
 def test_a_sheet_that_a_needle_stops_follows_what_the_needle_holds():
     """It falls by 13 cm a frame on a tip between its vertices, where pushes alone stretch it to five times."""
     pytest.importorskip("ipctk")
