@@ -30,7 +30,7 @@ from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.potential import corrected
 from eslr_jax.solver.preconditioner import stretched_stiffness
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms import FAST, Contact, scene_terms
 from eslr_jax.types import Scene
 
@@ -50,7 +50,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
     states, inputs = trajectory_states(run.trajectory, scene)
     state, step = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), (states, inputs))
     problem = jax.jit(frame_problem)(scene, state, step)
-    start = Start(*jax.jit(initial_guess)(problem))
+    start = jax.jit(initial_guess)(problem)
     surface, blocks = scene.body.surface, scene.garment.vertex_blocks
 
     @jax.jit

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError
-from eslr_jax.solver.guess import InitialGuess
+from eslr_jax.solver.guess import Start
 from eslr_jax.solver.potential import Point
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.types import ClothState, Normalizer
@@ -29,7 +29,7 @@ class Prediction(NamedTuple):
     """What a network makes of a frame."""
 
     positions: Float[Array, "steps vertices 3"]  # at t + 1, after every refinement step [m]
-    guess: InitialGuess | None = None  # that was refined; None for one acceleration
+    guess: Start | None = None  # that was refined; None for one acceleration
     previous: Point | None = None  # the lowest point that a refinement step began from
 
     @property

@@ -15,7 +15,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.networks.network import Network, Prediction
 from eslr_jax.numerics import safe_norm
-from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.guess import Start, initial_guess
 from eslr_jax.solver.lbfgs import Minimum
 from eslr_jax.solver.potential import (
     Point,
@@ -25,7 +25,7 @@ from eslr_jax.solver.potential import (
     evaluate,
     potential_terms,
 )
-from eslr_jax.solver.solve import MOST_RESIDUAL, Start, lower_point, solve_frame
+from eslr_jax.solver.solve import MOST_RESIDUAL, lower_point, solve_frame
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
 
@@ -164,7 +164,7 @@ def next_state(
 
     Args:
         position: Positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem.
+        problem: The frame's problem, whose data have derivatives.
         state: Cloth at t.
         status: Bits that the frame has raised so far.
         residual: Force norm over weight that the frame ended with.

@@ -16,7 +16,7 @@ _COLLAPSED = 1e-6  # of a face's rest area, below which its normal means nothing
 _OFFSET = 1e-6  # [m] by which the corners of collapsed faces are spread
 
 
-class InitialGuess(NamedTuple):
+class Start(NamedTuple):
     """Where the solver and the networks begin a frame."""
 
     position: Float[Array, "vertices 3"]  # [m]
@@ -24,7 +24,7 @@ class InitialGuess(NamedTuple):
     previous: Point | None = None  # from which a network came to `position`; None for the solver's own guess
 
 
-def initial_guess(problem: FrameProblem) -> InitialGuess:
+def initial_guess(problem: FrameProblem) -> Start:
     """Return the lower of two guesses, with collapsed faces opened a little.
 
     The inertial guess suits cloth that rests or hangs. The ballistic guess, free fall, suits cloth that falls,
@@ -43,7 +43,7 @@ def initial_guess(problem: FrameProblem) -> InitialGuess:
         try_guess, jnp.stack([problem.inertial_guess, problem.inertial_guess - down])
     )
     lower = jnp.where(values[1] < values[0], guesses[1], guesses[0])
-    return InitialGuess(spread_collapsed(lower, problem), values[0])
+    return Start(spread_collapsed(lower, problem), values[0])
 
 
 def push_out(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:

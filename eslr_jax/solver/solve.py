@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
-from eslr_jax.solver.guess import InitialGuess
+from eslr_jax.solver.guess import Start
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
 from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
@@ -43,9 +43,6 @@ _PASSES = 3  # of a frame that is solved and corrected, at most
 # [weights] Force with which a frame is not yet solved, whatever its tolerance, and which BDF2 does not carry on.
 # Within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15.
 MOST_RESIDUAL = 5.0
-
-
-Start = InitialGuess  # where the solver begins a frame, of whatever origin
 
 
 def lower_point(reached: Point, previous: Point) -> Point:

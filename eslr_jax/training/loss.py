@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.networks.network import Network
-from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.guess import Start, pushed_out_guess
 from eslr_jax.solver.potential import potential_terms
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.types import ClothState
 

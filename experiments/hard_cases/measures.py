@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.pipeline.report.gap import trajectory_states
 from eslr_jax.simulation.frame import frame_problem
-from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.guess import Start, initial_guess
 from eslr_jax.solver.potential import potential
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms import Bending, Gravity, Inertia, Stretch
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.problem import FrameProblem, pin, vertex_masses, with_terms

@@ -22,7 +22,8 @@ from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.scene import build_scene
 from eslr_jax.simulation.stepper import next_state
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.guess import Start
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms import CLOTH, Collision, Friction
 from eslr_jax.types import Scene, tree_cast
 from inverse.sheet import RESULTS

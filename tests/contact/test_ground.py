@@ -11,7 +11,7 @@ from eslr_jax import SimConfig, plan_scene, prepare_scene, prepare_scenes, rollo
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.solver.guess import initial_guess
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms import CLOTH, FAST, Friction, Gravity, Ground
 
 ON = (*CLOTH, Ground(is_always=True), Friction())
@@ -65,7 +65,7 @@ def test_friction_stops_a_sliding_sheet_after_its_known_way():
 def test_newton_and_the_solver_find_the_same_minimum_on_the_ground():
     problem = jax.jit(first_problem)(sliding(0.5))
     reference = minimize_newton(problem)
-    found = jax.jit(lambda p: solve(p, Start(*initial_guess(p)), iterations=100))(problem)
+    found = jax.jit(lambda p: solve(p, initial_guess(p), iterations=100))(problem)
     np.testing.assert_allclose(np.asarray(found.position), reference.x, atol=2e-6)
 
 

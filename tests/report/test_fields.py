@@ -25,9 +25,9 @@ from eslr_jax.pipeline.report.fields import energy_shares, gap_shares, run_field
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_poses, run_trajectory, write_run
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.plan import first_frames
-from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.guess import Start, pushed_out_guess
 from eslr_jax.solver.potential import potential, potential_terms
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms import FAST, Gravity
 
 

@@ -28,7 +28,8 @@ from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.simulate import raise_for_status
-from eslr_jax.solver.solve import Start, solve, solve_hessian
+from eslr_jax.solver.guess import Start
+from eslr_jax.solver.solve import solve, solve_hessian
 from eslr_jax.terms import CLOTH, Air, Collision, Damping, Friction, Gravity, Ground, Term
 from eslr_jax.types import tree_cast
 

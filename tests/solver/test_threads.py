@@ -17,9 +17,9 @@ from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.mesh.prepare import with_rest_positions
 from eslr_jax.pipeline.fabrics import Described, describe_fabric, on_threads
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.guess import Start, initial_guess
 from eslr_jax.solver.potential import potential
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.solver.tangent import apply, tangent
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.stretch import stretch_energy

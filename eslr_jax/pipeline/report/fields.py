@@ -17,9 +17,9 @@ from eslr_jax.numerics import components, product
 from eslr_jax.pipeline.report.gap import map_frames
 from eslr_jax.pipeline.report.metrics import face_stretches
 from eslr_jax.pipeline.report.run import Run, run_trajectory
-from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.guess import Start, pushed_out_guess
 from eslr_jax.solver.potential import potential
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.terms.term import vertex_shares
 from eslr_jax.types import Scene, Trajectory

@@ -16,9 +16,10 @@ from eslr_jax.networks.network import Network
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.simulation.stepper import find_start, make_stepper, past_state
+from eslr_jax.solver.guess import Start
 from eslr_jax.solver.lbfgs import unknown_point
 from eslr_jax.solver.potential import potential
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 

@@ -19,7 +19,7 @@ from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.potential import evaluate
 from eslr_jax.solver.preconditioner import solve_stiffness, stretched_stiffness
-from eslr_jax.solver.solve import Start, solve
+from eslr_jax.solver.solve import solve
 from eslr_jax.terms import Air, Damping, scene_terms
 from eslr_jax.types import BodyMotion, Scene
 
@@ -73,7 +73,7 @@ def time_parts(network: Network | None, scene: Scene, config: SimConfig) -> dict
         "gradient of the potential": (lambda x: evaluate(x, problem), (guess.position,)),
         "preconditioner": (lambda x: solve_stiffness(stretched_stiffness(problem, x), x), (guess.position,)),
         f"solver, {_ITERATIONS} iterations": (
-            lambda guess: solve(problem, Start(*guess), iterations=_ITERATIONS).position,
+            lambda guess: solve(problem, guess, iterations=_ITERATIONS).position,
             (guess,),
         ),
         "whole frame": (lambda state: step_frame(stepper, scene, state, inputs)[0], (state,)),
