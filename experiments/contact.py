@@ -30,6 +30,7 @@ from eslr_jax.types import Scene, Trajectory
 
 OUTFITS = ("pants+tshirt", "shorts+dress", "underskirt+skirt", "tank+longsleeve", "pants+skirt")
 WORN = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress", *OUTFITS)
+FRAMES = 60
 EVERY = 3  # frames between those that are judged
 MOST_RESIDUAL = 20.0  # [weights]
 NAMES = ("worn", "vertices", "clip", "frames", "start")  # of a row
@@ -60,7 +61,7 @@ def load(worn: str, vertices: str = "1k") -> GarmentFile:
     return one(worn) if len(names) == 1 else combine_garments([one(name) for name in names], names)
 
 
-def dressed(worn: str, clip: str, vertices: str = "1k", frames: int = 60) -> Scene:
+def dressed(worn: str, clip: str, vertices: str = "1k", frames: int = FRAMES) -> Scene:
     """Return the scene that the command makes of a garment, or of an outfit, on the beginning of a clip."""
     body = load_body()
     poses = with_settling(pose_body(body, load_motion(clip), num_frames=frames), SETTLE_FRAMES, body)
@@ -101,7 +102,7 @@ def main() -> None:
     options.add_argument("--worn", nargs="*", default=WORN)
     options.add_argument("--clip", nargs="*", default=load_splits()["motions"]["test"])
     options.add_argument("--vertices", default="1k")
-    options.add_argument("--frames", type=int, default=60)
+    options.add_argument("--frames", type=int, default=FRAMES)
     chosen = options.parse_args()
 
     use_compile_cache()

@@ -385,19 +385,25 @@ def is_inside(
     Source: of several faces that are equally near the one decides that is seen least from the side, as in
     Baerentzen and Aanaes 2005, doi 10.1109/TVCG.2005.49.
     """
-    a, b, c = (components(body[corner]) for corner in surface.faces.T)
-    ab, ac = sub3(b, a), sub3(c, a)
-    normal = safe_normalize(jnp.stack(cross3(ab, ac), axis=1)).T
-    (ids,) = jnp.nonzero(may_be, size=len(may_be), fill_value=0)
 
-    def look(number: Array, found: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
-        vertex = ids[number]
-        query = tuple(jnp.broadcast_to(part, a[0].shape) for part in position[vertex])
-        _, u, v = point_triangle(query, a, b, c)  # type: ignore[arg-type]
-        offset = jnp.stack([q - o - u * i - v * j for q, o, i, j in zip(query, a, ab, ac, strict=True)])
-        distance, height = safe_norm(offset, axis=0), jnp.sum(offset * normal, axis=0)
-        is_nearest = distance <= jnp.min(distance) + _EQUALLY
-        steepest = jnp.argmax(jnp.where(is_nearest, jnp.abs(height), -1.0))
-        return found.at[vertex].set(height[steepest] < 0)
+    def look_at_all() -> Bool[Array, " vertices"]:
+        rows = face_corners(body, surface.faces).T.reshape(3, 3, -1)
+        a, b, c = (tuple(corner) for corner in rows)
+        ab, ac = sub3(b, a), sub3(c, a)
+        normal = safe_normalize(jnp.stack(cross3(ab, ac), axis=1)).T
+        (ids,) = jnp.nonzero(may_be, size=len(may_be), fill_value=0)
 
-    return jax.lax.fori_loop(0, jnp.sum(may_be), look, jnp.zeros_like(may_be))
+        def look(number: Array, found: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
+            vertex = ids[number]
+            query = tuple(jnp.broadcast_to(part, a[0].shape) for part in position[vertex])
+            _, u, v = point_triangle(query, a, b, c)  # type: ignore[arg-type]
+            offset = jnp.stack([q - o - u * i - v * j for q, o, i, j in zip(query, a, ab, ac, strict=True)])
+            distance, height = safe_norm(offset, axis=0), jnp.sum(offset * normal, axis=0)
+            is_nearest = distance <= jnp.min(distance) + _EQUALLY
+            steepest = jnp.argmax(jnp.where(is_nearest, jnp.abs(height), -1.0))
+            return found.at[vertex].set(height[steepest] < 0)
+
+        return jax.lax.fori_loop(0, jnp.sum(may_be), look, jnp.zeros_like(may_be))
+
+    # In most frames there is nothing to look at.
+    return jax.lax.cond(jnp.any(may_be), look_at_all, lambda: jnp.zeros_like(may_be))

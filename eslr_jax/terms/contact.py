@@ -75,8 +75,7 @@ def _begun(problem: FrameProblem) -> Float[Array, "all_vertices 3"]:
     start, touched = body.start, problem.data_of(Collision)
     if touched is not None:
         nearest = touched.nearest
-        depth = jnp.sum((nearest.points - position) * nearest.normals, axis=1)
-        may_be = nearest.is_near & (depth > 0) & free_vertices(problem)
+        may_be = nearest.is_near & (nearest.distances < 0) & free_vertices(problem)
         inside = is_inside(*jax.lax.stop_gradient((may_be, position, start, body.surface)))
         position = jnp.where(inside[:, None], nearest.points + CLEARANCE * nearest.normals, position)
         start = jax.lax.cond(jnp.any(inside), _under_skin, lambda body, _: body, start, body.surface)
