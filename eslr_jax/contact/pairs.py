@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.search import append
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, dot3, sub3
 
@@ -123,7 +122,6 @@ class _Course(NamedTuple):
     least: Float[Array, " rows"]  # gap that a direction has to show [m]
     is_parted: Bool[Array, " rows"]  # nothing has met so far
     last: Vector3  # the normal where the first section begins that no direction separates
-    share: Float[Array, " rows"]  # of the way at which that section begins
 
 
 def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: bool) -> _Course:
@@ -153,41 +151,12 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
         before = _where(is_first, normal, course.normal)
         meets = course.is_parted & ~is_parted
         last = _where(is_first, normal, _where(meets, before, course.last))
-        begun = jnp.where(meets, share - 1.0 / _SECTIONS, course.share)
-        return _Course(corners, normal, least, course.is_parted & is_parted, last, begun)
+        return _Course(corners, normal, least, course.is_parted & is_parted, last)
 
     nothing = jnp.zeros_like(start[0][0])
     nowhere = (nothing, nothing, nothing)
-    first = _Course(start, nowhere, nothing, jnp.ones(nothing.shape, bool), nowhere, nothing)
+    first = _Course(start, nowhere, nothing, jnp.ones(nothing.shape, bool), nowhere)
     return jax.lax.fori_loop(0, _SECTIONS + 1, section, first)
-
-
-class Met(NamedTuple):
-    """Pairs of one kind that would meet on their ways, in a table of fixed size; those in use come first."""
-
-    ids: Int[Array, "corners rows"]
-    share: Float[Array, " rows"]  # of the way up to which they are parted
-    count: Int[Array, ""]  # rows in use
-
-
-def find_met(start: Vector3, end: Vector3, pairs: Pairs, rows: int) -> tuple[Met, Met]:
-    """Return those of some pairs, faces first, that may meet on straight ways [m]; as many as a table holds."""
-    found = []
-    for kind, is_edge in pairs.kinds:
-
-        def add(carry, ids: Array, is_used: Array, is_edge: bool = is_edge):
-            course = _followed(corners_of(start, ids), corners_of(end, ids), is_edge)
-            return append(*carry, (ids, course.share), is_used & ~course.is_parted)
-
-        *tables, count = nothing_met(rows, start[0].dtype)
-        (ids, share), count = over_rows(kind, (tuple(tables), count), add)
-        found.append(Met(ids, share, jnp.minimum(count, rows)))
-    return found[0], found[1]
-
-
-def nothing_met(rows: int, dtype: Any) -> Met:
-    """Return an empty table."""
-    return Met(jnp.zeros((4, rows), jnp.int32), jnp.zeros(rows, dtype), jnp.int32(0))
 
 
 def _heights(normal: Vector3, p: tuple[Vector3, ...]) -> list[Array]:

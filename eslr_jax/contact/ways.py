@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lists import Meshes, Motion, find_pairs
-from eslr_jax.contact.pairs import Met, find_met, nothing_met, pushed_apart
+from eslr_jax.contact.pairs import pushed_apart
 from eslr_jax.numerics import Vector3, safe_norm
 
 _MARGIN = 2e-3  # [m] that vertices may be pushed before pairs are looked for again
-FAR = 5e-3  # [m] that a vertex is pushed, which cloth around it should know of; a T-shirt's are by 1 to 3 mm
 _SWEEPS = 60  # of pushes
 _TRIES = 4  # searches for one part of the motion, before it is halved
 _LEAST_PART = 1.0 / 64.0  # of the motion, at which cloth is let through
@@ -25,7 +24,6 @@ class Moved(NamedTuple):
     position: Float[Array, "3 vertices"]  # [m]
     is_passed: Bool[Array, ""]  # something may have passed through the cloth
     most: Int[Array, ""]  # rows that the fullest search would have needed
-    met: tuple[Met, Met]  # what kept it off its way where it was pushed far, faces first
 
 
 class _Part(NamedTuple):
@@ -38,7 +36,6 @@ class _Part(NamedTuple):
     tries: Int[Array, ""]
     is_passed: Bool[Array, ""]
     most: Int[Array, ""]
-    met: tuple[Met, Met]
 
 
 def move_clear(
@@ -49,7 +46,6 @@ def move_clear(
     meshes: Meshes,
     is_free: Bool[Array, " vertices"],
     rows: int,
-    most_met: int = 0,
 ) -> Moved:
     """Move cloth along its way, off which it is pushed where it would cross the body or itself.
 
@@ -63,7 +59,6 @@ def move_clear(
         meshes: Of both.
         is_free: Vertices that may be pushed.
         rows: Size of the tables of pairs; static.
-        most_met: Size of the tables of pairs that are met; static. Without a size none are looked for.
     """
     count = x.shape[1]
     ways = jnp.concatenate([way, body_way], axis=1)
@@ -82,14 +77,6 @@ def move_clear(
         reached = jnp.stack(pushed)[:, :count]
         farthest = jnp.max(safe_norm(reached - part.end, axis=0))
         is_full = found.most > rows
-        is_whole = (part.share == 0.0) & (part.length == 1.0) & (part.tries == 0)
-        met = part.met
-        if most_met:  # where cloth is put on nobody asks for them, and they needn't be compiled
-            met = jax.lax.cond(
-                is_whole & (farthest > FAR),
-                lambda: find_met(_rows(start), _rows(end), found.pairs, most_met),
-                lambda: part.met,
-            )
         is_clear = (lack == 0) & (farthest <= _MARGIN) & ~is_full
         is_tried = part.tries + 1 >= _TRIES
         # With too small a table the frame is done anew.
@@ -108,14 +95,12 @@ def move_clear(
             tries=jnp.where(is_new, 0, part.tries + 1),
             is_passed=part.is_passed | (is_done & ~is_clear),
             most=jnp.maximum(part.most, found.most),
-            met=met,
         )
 
     one, no = jnp.ones((), x.dtype), jnp.zeros((), bool)
-    none = nothing_met(most_met, x.dtype)
-    whole = _Part(x, x + way, 0.0 * one, one, jnp.int32(0), no, jnp.int32(0), (none, none))
+    whole = _Part(x, x + way, 0.0 * one, one, jnp.int32(0), no, jnp.int32(0))
     final = jax.lax.while_loop(lambda part: part.share < 1.0, attempt, whole)
-    return Moved(final.x, final.is_passed, final.most, final.met)
+    return Moved(final.x, final.is_passed, final.most)
 
 
 def _rows(values: Float[Array, "3 vertices"]) -> Vector3:

@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lists import Meshes, Motion, find_pairs, joint_meshes
 from eslr_jax.contact.nearest import CLEARANCE, clear_of_body, is_inside
-from eslr_jax.contact.pairs import CHUNK, Met, closest, corners_of
+from eslr_jax.contact.pairs import CHUNK, closest, corners_of
 from eslr_jax.contact.ways import move_clear
 from eslr_jax.errors import Status
-from eslr_jax.numerics import Vector3, components, dot3, segment_sum, sub3, vertex_normals
+from eslr_jax.numerics import Vector3, components, dot3, safe_norm, segment_sum, sub3, vertex_normals
 from eslr_jax.terms.collision import Collision
 from eslr_jax.terms.friction import Friction, slip_energies
 from eslr_jax.terms.problem import (
@@ -43,6 +43,9 @@ _NEAR_SHARE, _LEAST_NEAR = 32, 256
 # are still known in the next; less for the body, off which its own term keeps vertices.
 _NEAR_CLOTH, _NEAR_BODY = 4e-3, 1.5e-3
 _RIM = 1e-3  # weight of a vertex below which the nearest point lies on the rim
+# [m] that a vertex is pushed, which cloth around it has to follow; a T-shirt's are by 1 to 3 mm. There vertices
+# that are pushed by more than the second length are held; the rest is left to pushes.
+_FAR, _HELD = 5e-3, 5e-4
 _SWEEPS = 2  # in which the guess is pushed out; a third one measured no better
 
 
@@ -93,7 +96,7 @@ Corners = tuple[Vector3, ...]
 
 
 class NearPairs(NamedTuple):
-    """Pairs that are near each other at t, or meet later, and the direction that parts them there."""
+    """Pairs that are near each other at t, and the direction that parts them there."""
 
     # Of the cloth. Where a corner is the body's, a vertex of the pair's cloth with the weight zero.
     vertices: Int[Array, "corners rows"]
@@ -129,16 +132,30 @@ def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3])
     )
 
 
+class Planes(NamedTuple):
+    """What keeps vertices where they were pushed to: a plane each, across the push."""
+
+    normal: Vector3
+    height: Float[Array, " vertices"]  # along the normal, below which the barrier begins [m]
+    stiffness: Float[Array, " vertices"]  # [J/m^3], times the cloth's area; zero where there is no plane
+
+    def depths(self, x: Vector3) -> Float[Array, " vertices"]:
+        """Return how far vertices are below where the barrier begins [m]."""
+        depth = jnp.maximum(self.height - dot3(self.normal, x), 0.0)
+        return jnp.where(self.stiffness > 0, depth, 0.0)
+
+
 class Meetings(NamedTuple):
     """Pairs of a frame, and what came of its ends."""
 
     start: Float[Array, "all_vertices 3"]  # of `_begun`
     near: NearPairs
+    planes: Planes
     most_near: Int[Array, ""]  # that the fuller table of them would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
     is_passed: Bool[Array, ""] | bool = False
     most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
-    is_far: Bool[Array, ""] | bool = False  # an end was pushed by `ways.FAR`
+    is_far: Bool[Array, ""] | bool = False  # an end was pushed by `_FAR`
 
 
 @struct.dataclass
@@ -152,7 +169,7 @@ class Contact(Term):
     An energy can be overcome, and pairs that come near within the frame have none. So the positions that the
     frame would end with are pushed until no pair has met on the straight ways from the frame's start. Cloth that
     starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed
-    far, pairs that met on the way get the energy too, along the direction that parted them last, and the frame is
+    far, the cloth around has to follow: what was pushed is held by planes with the same barrier, and the frame is
     solved once more. The body yields where its own parts pass through each other (`mesh.parting`). Where that
     makes no room, something is let through, and the trajectory says in which frame.
 
@@ -241,9 +258,11 @@ class Contact(Term):
         kinds = []
         for rows, is_edge in found.pairs.kinds:
             here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
-            kinds.append(self._near(rows.ids, rows.count, is_edge, here, here, there, problem))
+            kinds.append(self._near(rows.ids, rows.count, is_edge, here, there, problem))
         near = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *kinds)
-        return Meetings(start, near, found.most, _friction(problem).slip(problem))
+        nothing = jnp.zeros(count, start.dtype)
+        planes = Planes((nothing, nothing, nothing), nothing, nothing)
+        return Meetings(start, near, planes, found.most, _friction(problem).slip(problem))
 
     def _near(
         self,
@@ -251,19 +270,13 @@ class Contact(Term):
         count: Int[Array, ""],
         is_edge: bool,
         start: Corners,
-        there: Corners,
         end: Corners,
         problem: FrameProblem,
-        *,
-        is_met: bool = False,
     ) -> NearPairs:
-        """Return pairs from their vertices at t, where the normal between them is taken, and at t + 1.
-
-        At t + 1 it is the body's that are read. `is_met` are pairs that are far from each other at t.
-        """
+        """Return pairs from their vertices at t and at t + 1, where it is the body's that are read."""
         areas = problem.garment.vertex_areas
         is_cloth = ids < len(areas)
-        near = closest(there, is_edge)
+        near = closest(start, is_edge)
         weights = jnp.stack(near.weights)
         of_body = jnp.where(is_cloth, 0.0, weights)
         # Corners of the cloth stand in for those of the body: a first primitive's, or else a second one's.
@@ -274,7 +287,7 @@ class Contact(Term):
         # Where a pair is nearest on the rim, the normal leans, and would stand in the way of what slides: its
         # neighbours hold it.
         is_counted = jnp.min(jnp.abs(weights), axis=0) > _RIM
-        if not (is_edge or is_met):  # a vertex over the body is `Collision`'s, which knows what is near at t
+        if not is_edge:  # a vertex over the body is `Collision`'s, which knows what is near at t
             is_counted = is_counted & ~(is_cloth[0] & ~is_cloth[1])
         is_counted = is_counted & (jnp.arange(ids.shape[1]) < count)
         stiffness = self.stiffness * contact_excess(problem.material) * area
@@ -323,45 +336,33 @@ class Contact(Term):
             self._meshes(problem.garment, problem.body),
             free_vertices(problem),
             self._num_rows(count),
-            self._near_rows(count),
         )
-        pushed = ended.position.T - jax.lax.stop_gradient(position)
-        is_far = ended.met[0].count + ended.met[1].count > 0
-        near = jax.lax.cond(
-            is_far,
-            lambda: jax.lax.stop_gradient(self._with_met(data, ended.met, end, problem)),
-            lambda: jax.lax.stop_gradient(data.near),
-        )
-        found = data._replace(near=near, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
-        return position + pushed, found
-
-    def _with_met(
-        self, data: Meetings, met: tuple[Met, Met], end: Float[Array, "all_vertices 3"], problem: FrameProblem
-    ) -> NearPairs:
-        """Return near pairs and those that cloth would meet on its way, as far as the table holds them."""
-        start, near = data.start, data.near
-        for (ids, share, count), is_edge in zip(met, (False, True), strict=True):
-            here, there = corners_of(components(start), ids), corners_of(components(end), ids)
-            parted = jax.tree.map(lambda a, b, share=share: (1.0 - share) * a + share * b, here, there)
-            more = self._near(ids, count, is_edge, here, parted, there, problem, is_met=True)
-            size = near.stiffness.shape[0]
-            (unused,) = jnp.nonzero(near.stiffness == 0, size=ids.shape[1], fill_value=size)
-            near = jax.tree.map(
-                lambda old, new, unused=unused: old.at[..., unused].set(new, mode="drop"), near, more
-            )
-        return near
+        pushed = ended.position - jax.lax.stop_gradient(position.T)
+        length = safe_norm(pushed, axis=0)
+        is_far = jnp.any(length > _FAR)
+        is_held = is_far & (length > _HELD)
+        normal = pushed / jnp.where(is_held, length, 1.0)
+        height = self.thickness + jnp.sum(normal * ended.position, axis=0)
+        stiffness = self.stiffness * contact_excess(problem.material) * problem.garment.vertex_areas
+        planes = jax.lax.stop_gradient(Planes(tuple(normal), height, stiffness))  # type: ignore[arg-type]
+        planes = jax.tree.map(lambda new, old: jnp.where(is_held, new, old), planes, data.planes)
+        found = data._replace(planes=planes, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
+        return position + pushed.T, found
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Meetings) -> tuple[Elements, ...]:
-        """Return the energy of every near pair [J].
+        """Return the energy of every near pair, and of every vertex over its plane [J].
 
-        That is stiffness a max(thickness - h, 0)^3, with the area a of its cloth [m^2], and that of friction, see
-        `friction.friction_energies`.
+        That is stiffness a max(thickness - h, 0)^3, with the area a of the cloth [m^2], and for pairs that of
+        friction, see `friction.friction_energies`.
         """
         near = data.near
         offset = near.offsets(x)
         depth = near.depths(offset)
         slipped = slip_energies(sub3(offset, near.start), near.normal, near.rubbing, data.slip)
-        return (Elements(near.stiffness * depth * depth * depth + slipped, near.vertices.T),)
+        pairs = Elements(near.stiffness * depth * depth * depth + slipped, near.vertices.T)
+        below = data.planes.depths(x)
+        vertices = jnp.arange(len(below), dtype=near.vertices.dtype)[:, None]
+        return pairs, Elements(data.planes.stiffness * below * below * below, vertices)
 
     def diagonal(self, x: Vector3, problem: FrameProblem, data: Meetings) -> Float[Array, " vertices"]:
         """Return a third of the curvatures [N/m]: along the normals, and across them where pairs stick."""
@@ -369,7 +370,7 @@ class Contact(Term):
         curvature = 2.0 * near.stiffness * near.depths(near.offsets(x)) + near.rubbing / (3.0 * data.slip)
         corners = zip(near.vertices, near.weights, strict=True)
         parts = [segment_sum(curvature * w * w, ids, len(x[0])) for ids, w in corners]
-        return sum(parts, jnp.zeros_like(x[0]))
+        return sum(parts, 2.0 * data.planes.stiffness * data.planes.depths(x))
 
     def status(self, problem: FrameProblem, data: Meetings) -> Int[Array, ""]:
         """Return whether a table was too small."""
