@@ -7,13 +7,15 @@
 All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every third
 frame a referee counts pairs of triangles that intersect, of cloth with the body and of cloth with cloth. A start
 fails where there is one, where the simulator let something through, or where a frame ends with a force of 20
-weights. An outfit is written from the inside outwards; a `skirt` and an `underskirt` are a dress without its top.
+weights. How far the most stretched face goes is kept, too. An outfit is written from the inside outwards; a
+`skirt` and an `underskirt` are a dress without its top.
 
 Rows of contact.json stay until they are measured again.
 """
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 from hard_cases.case import shifted
 from harness import machine, parser, put
@@ -26,6 +28,7 @@ from eslr_jax.pipeline.dressing.outfit import combine_garments
 from eslr_jax.pipeline.formats.garment import GarmentFile
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
+from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Scene, Trajectory
 
 OUTFITS = ("pants+tshirt", "shorts+dress", "underskirt+skirt", "tank+longsleeve", "pants+skirt")
@@ -86,11 +89,14 @@ def judge(scene: Scene, trajectory: Trajectory) -> dict[str, object]:
     assert trajectory.is_passed is not None
     passed = np.flatnonzero(np.asarray(trajectory.is_passed)[SETTLE_FRAMES:])
     residual = float(np.max(np.asarray(trajectory.residuals)[SETTLE_FRAMES:]))
+    settled = trajectory.positions[SETTLE_FRAMES:]
+    stretches = jax.lax.map(lambda x: principal_stretches(x, cloth)[0].max(), settled)
     return {
         "cloth_body": sum(of_body),
         "cloth_cloth": sum(of_cloth),
         "let_through": passed.tolist(),
         "residual_max": round(residual, 2),
+        "stretch_max": round(float(stretches.max()), 3),
         "iterations": round(float(np.mean(np.asarray(trajectory.iterations)[SETTLE_FRAMES:])), 1),
         "passed": not (sum(of_body) or sum(of_cloth) or len(passed)) and residual < MOST_RESIDUAL,
     }

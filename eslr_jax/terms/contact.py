@@ -341,7 +341,7 @@ class Contact(Term):
         length = safe_norm(pushed, axis=0)
         is_far = jnp.any(length > _FAR)
         is_held = is_far & (length > _HELD)
-        normal = pushed / jnp.where(is_held, length, 1.0)
+        normal = pushed / jnp.where(is_held, length, 1.0)[None]
         height = self.thickness + jnp.sum(normal * ended.position, axis=0)
         stiffness = self.stiffness * contact_excess(problem.material) * problem.garment.vertex_areas
         planes = jax.lax.stop_gradient(Planes(tuple(normal), height, stiffness))  # type: ignore[arg-type]
