@@ -74,14 +74,18 @@ def parted(
 
 
 def _sampled(positions: Float[np.ndarray, "frames vertices 3"]) -> Iterator[np.ndarray]:
-    """Yield where a body is [m], so often that no part of it passes another unseen."""
+    """Yield where a body is [m], so often that no part of it comes near another, or passes it, unseen.
+
+    Two parts that both move by `_AROUND` come nearer by twice as much, and are near for as long.
+    """
     last = positions[0]
     yield last
     for here, there in itertools.pairwise(positions):
-        if _spread(last, there) > 2 * _AROUND:
-            count = math.ceil(_spread(here, there) / (2 * _AROUND))
+        if _spread(last, there) > _AROUND:
+            count = math.ceil(_spread(here, there) / _AROUND)
             yield from (here + share * (there - here) for share in np.arange(1, count + 1) / count)
             last = there
+    yield positions[-1]
 
 
 def _places(positions: Float[np.ndarray, "frames vertices 3"], frame: int) -> list[np.ndarray]:

@@ -146,10 +146,12 @@ def _solve(
         spent = last.minimum.iterations + minimum.iterations
         position, data = corrected(minimum.position, now)
         solved = Solved(minimum._replace(position=position, iterations=spent), data)
-        # What can't be reached without letting something through is no end for a frame that has another one.
-        is_worse = (count > 0) & is_passed(data) & ~is_passed(last.data)
+        # What can't be reached without letting something through is no end for a frame that has another one, and
+        # once more does not help it.
+        is_lost = (count > 0) & is_passed(data)
+        is_worse = is_lost & ~is_passed(last.data)
         kept = jax.tree.map(lambda old, new: jnp.where(is_worse, old, new), last, solved)
-        return kept, jnp.where(is_worse, _PASSES, count + 1)
+        return kept, jnp.where(is_lost, _PASSES, count + 1)
 
     nothing = jnp.zeros_like(start.position)
     unknown = jnp.zeros_like(start.inertial_energy)
