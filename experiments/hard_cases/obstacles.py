@@ -69,7 +69,6 @@ NEEDLE = HardCase(
     "needle",
     "a tip of 2 mm finds the gap between vertices 16 mm apart",
     *(_build_needle, _measure_needle, "needle"),
-    limit="where the rim slides off the tip an edge stretches to 2.0 times for a frame, in two of ten starts",
 )
 
 
