@@ -1,4 +1,4 @@
-"""A level ground that does not move."""
+"""Planes that do not move, such as a level ground."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ def ground_contacts(position: Float[Array, "vertices 3"], height: Float[Array, "
     """
     points = position.at[:, 1].set(height)
     normals = jnp.zeros_like(position).at[:, 1].set(1.0)
-    return Contacts(
-        points=points,
-        next_points=points,
-        normals=normals,
-        next_normals=normals,
-        distances=position[:, 1] - height,
-        is_near=jnp.ones(position.shape[0], bool),
-        faces=jnp.zeros(position.shape[0], jnp.int32),
-    )
+    return still_contacts(points, normals, position[:, 1] - height, jnp.ones(position.shape[0], bool))
+
+
+def still_contacts(
+    points: Float[Array, "vertices 3"],
+    normals: Float[Array, "vertices 3"],
+    distances: Float[Array, " vertices"],
+    is_near: Bool[Array, " vertices"],
+) -> Contacts:
+    """Return contacts with planes through points [m], across normals, that do not move within a frame."""
+    faces = jnp.zeros(points.shape[0], jnp.int32)
+    return Contacts(points, points, normals, normals, distances, is_near, faces)
 
 
 def clear_of_ground(

@@ -101,7 +101,7 @@ def solve_frame(
 ) -> Solved:
     """Solve a frame, and let its terms correct where it ends (`Term.correct`) if `is_corrected`, which is static.
 
-    Where they move cloth far, the cloth around knows nothing of it. Then the frame is solved once more from
+    Where they move cloth far, the cloth around knows nothing of it. Then the frame is solved again from
     there, with their new data. The other arguments, errors and derivatives are those of `solve`; these take no
     notice of corrections.
     """

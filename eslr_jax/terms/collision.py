@@ -28,10 +28,10 @@ from eslr_jax.types import Contacts, Garment, Obstacle
 
 
 class BodyContact(NamedTuple):
-    """Contact of the cloth with the body, or with the ground, during a frame."""
+    """Contact of the cloth's vertices with the body, or with planes such as the ground, during a frame."""
 
     nearest: Contacts
-    opposing: Contacts | None  # with the body part on the other side of the cloth; None on the ground
+    opposing: Contacts | None  # with the body part on the other side of the cloth; None for still planes
     thickness: Float[Array, ""] | float  # distance that vertices keep [m]
     stiffness: Float[Array, ""]  # [J/m^5]
 

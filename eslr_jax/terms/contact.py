@@ -12,13 +12,23 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.contact.ground import still_contacts
 from eslr_jax.contact.lists import Meshes, Motion, find_pairs, joint_meshes
 from eslr_jax.contact.nearest import CLEARANCE, clear_of_body, is_inside
 from eslr_jax.contact.pairs import CHUNK, closest, corners_of
 from eslr_jax.contact.ways import move_clear
 from eslr_jax.errors import Status
-from eslr_jax.numerics import Vector3, components, dot3, safe_norm, segment_sum, sub3, vertex_normals
-from eslr_jax.terms.collision import Collision
+from eslr_jax.numerics import (
+    Vector3,
+    components,
+    dot3,
+    safe_norm,
+    safe_normalize,
+    segment_sum,
+    sub3,
+    vertex_normals,
+)
+from eslr_jax.terms.collision import BodyContact, Collision, collision_energies, penetration
 from eslr_jax.terms.friction import Friction, slip_energies
 from eslr_jax.terms.problem import (
     CONTACT_STIFFNESS,
@@ -132,25 +142,12 @@ def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3])
     )
 
 
-class Planes(NamedTuple):
-    """What keeps vertices where they were pushed to: a plane each, across the push."""
-
-    normal: Vector3
-    height: Float[Array, " vertices"]  # along the normal, below which the barrier begins [m]
-    stiffness: Float[Array, " vertices"]  # [J/m^3], times the cloth's area; zero where there is no plane
-
-    def depths(self, x: Vector3) -> Float[Array, " vertices"]:
-        """Return how far vertices are below where the barrier begins [m]."""
-        depth = jnp.maximum(self.height - dot3(self.normal, x), 0.0)
-        return jnp.where(self.stiffness > 0, depth, 0.0)
-
-
 class Meetings(NamedTuple):
     """Pairs of a frame, and what came of its ends."""
 
     start: Float[Array, "all_vertices 3"]  # of `_begun`
     near: NearPairs
-    planes: Planes
+    held: BodyContact  # with planes across the pushes of vertices, which keep them where they were pushed to
     most_near: Int[Array, ""]  # that the fuller table of them would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
     is_passed: Bool[Array, ""] | bool = False
@@ -170,7 +167,7 @@ class Contact(Term):
     frame would end with are pushed until no pair has met on the straight ways from the frame's start. Cloth that
     starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed
     far, the cloth around has to follow: what was pushed is held by planes with the same barrier, and the frame is
-    solved once more. The body yields where its own parts pass through each other (`mesh.parting`). Where that
+    solved again. The body yields where its own parts pass through each other (`mesh.parting`). Where that
     makes no room, something is let through, and the trajectory says in which frame.
 
     A derivative takes no notice of the pushes.
@@ -255,14 +252,16 @@ class Contact(Term):
         still = jax.tree.map(jnp.zeros_like, x)
         motion = jax.lax.stop_gradient(Motion(x, still, radius))
         found = find_pairs(motion, self._meshes(problem.garment, problem.body), self._near_rows(count))
+        stiffness = self.stiffness * contact_excess(problem.material)
         kinds = []
         for rows, is_edge in found.pairs.kinds:
             here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
-            kinds.append(self._near(rows.ids, rows.count, is_edge, here, there, problem))
+            kinds.append(self._near(rows.ids, rows.count, is_edge, here, there, stiffness, problem))
         near = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *kinds)
-        nothing = jnp.zeros(count, start.dtype)
-        planes = Planes((nothing, nothing, nothing), nothing, nothing)
-        return Meetings(start, near, planes, found.most, _friction(problem).slip(problem))
+        nowhere = jnp.zeros_like(problem.position)
+        none = still_contacts(nowhere, nowhere, nowhere[:, 0], jnp.zeros(count, bool))
+        held = BodyContact(none, None, self.thickness, stiffness)
+        return Meetings(start, near, held, found.most, _friction(problem).slip(problem))
 
     def _near(
         self,
@@ -271,9 +270,13 @@ class Contact(Term):
         is_edge: bool,
         start: Corners,
         end: Corners,
+        stiffness: Float[Array, ""],
         problem: FrameProblem,
     ) -> NearPairs:
-        """Return pairs from their vertices at t and at t + 1, where it is the body's that are read."""
+        """Return pairs from their vertices at t and at t + 1, where it is the body's that are read.
+
+        The stiffness is of the barrier [J/m^5].
+        """
         areas = problem.garment.vertex_areas
         is_cloth = ids < len(areas)
         near = closest(start, is_edge)
@@ -290,7 +293,6 @@ class Contact(Term):
         if not is_edge:  # a vertex over the body is `Collision`'s, which knows what is near at t
             is_counted = is_counted & ~(is_cloth[0] & ~is_cloth[1])
         is_counted = is_counted & (jnp.arange(ids.shape[1]) < count)
-        stiffness = self.stiffness * contact_excess(problem.material) * area
         near_pairs = NearPairs(
             vertices=vertices,
             weights=own,
@@ -298,7 +300,7 @@ class Contact(Term):
             start=_weighted(weights, start),
             normal=near.normal,
             thickness=self.thickness * jnp.maximum(sides, 1.0),
-            stiffness=jnp.where(is_counted, stiffness, 0.0),
+            stiffness=jnp.where(is_counted, stiffness * area, 0.0),
             rubbing=jnp.zeros_like(area),
         )
         depth = near_pairs.depths(near_pairs.start)
@@ -337,17 +339,21 @@ class Contact(Term):
             free_vertices(problem),
             self._num_rows(count),
         )
-        pushed = ended.position - jax.lax.stop_gradient(position.T)
-        length = safe_norm(pushed, axis=0)
+        reached = ended.position.T
+        pushed = reached - jax.lax.stop_gradient(position)
+        length = safe_norm(pushed, axis=1)
         is_far = jnp.any(length > _FAR)
         is_held = is_far & (length > _HELD)
-        normal = pushed / jnp.where(is_held, length, 1.0)[None]
-        height = self.thickness + jnp.sum(normal * ended.position, axis=0)
-        stiffness = self.stiffness * contact_excess(problem.material) * problem.garment.vertex_areas
-        planes = jax.lax.stop_gradient(Planes(tuple(normal), height, stiffness))  # type: ignore[arg-type]
-        planes = jax.tree.map(lambda new, old: jnp.where(is_held, new, old), planes, data.planes)
-        found = data._replace(planes=planes, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
-        return position + pushed.T, found
+        last, is_new = data.held.nearest, is_held[:, None]
+        nearest = still_contacts(
+            jnp.where(is_new, reached, last.next_points),
+            jnp.where(is_new, safe_normalize(pushed), last.next_normals),
+            last.distances,
+            is_held | last.is_near,
+        )
+        held = data.held._replace(nearest=jax.lax.stop_gradient(nearest))
+        found = data._replace(held=held, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
+        return position + pushed, found
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Meetings) -> tuple[Elements, ...]:
         """Return the energy of every near pair, and of every vertex over its plane [J].
@@ -355,22 +361,23 @@ class Contact(Term):
         That is stiffness a max(thickness - h, 0)^3, with the area a of the cloth [m^2], and for pairs that of
         friction, see `friction.friction_energies`.
         """
-        near = data.near
+        near, held = data.near, data.held
         offset = near.offsets(x)
         depth = near.depths(offset)
         slipped = slip_energies(sub3(offset, near.start), near.normal, near.rubbing, data.slip)
         pairs = Elements(near.stiffness * depth * depth * depth + slipped, near.vertices.T)
-        below = data.planes.depths(x)
-        vertices = jnp.arange(len(below), dtype=near.vertices.dtype)[:, None]
-        return pairs, Elements(data.planes.stiffness * below * below * below, vertices)
+        planes = collision_energies(x, held.nearest, problem.garment, held.stiffness, held.thickness)
+        vertices = jnp.arange(len(planes), dtype=near.vertices.dtype)[:, None]
+        return pairs, Elements(planes, vertices)
 
     def diagonal(self, x: Vector3, problem: FrameProblem, data: Meetings) -> Float[Array, " vertices"]:
         """Return a third of the curvatures [N/m]: along the normals, and across them where pairs stick."""
-        near = data.near
+        near, held = data.near, data.held
+        below = penetration(x, held.nearest, held.thickness)
         curvature = 2.0 * near.stiffness * near.depths(near.offsets(x)) + near.rubbing / (3.0 * data.slip)
         corners = zip(near.vertices, near.weights, strict=True)
         parts = [segment_sum(curvature * w * w, ids, len(x[0])) for ids, w in corners]
-        return sum(parts, 2.0 * data.planes.stiffness * data.planes.depths(x))
+        return sum(parts, 2.0 * held.stiffness * problem.garment.vertex_areas * below)
 
     def status(self, problem: FrameProblem, data: Meetings) -> Int[Array, ""]:
         """Return whether a table was too small."""
