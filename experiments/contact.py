@@ -15,9 +15,9 @@ Rows of contact.json stay until they are measured again.
 
 from __future__ import annotations
 
-import jax
 import numpy as np
-from hard_cases.case import shifted
+from hard_cases.case import Run, shifted
+from hard_cases.measures import largest_stretch
 from harness import machine, parser, put
 
 from eslr_jax import load_body, load_motion, pose_body, prepare_scene, simulate
@@ -28,7 +28,6 @@ from eslr_jax.pipeline.dressing.outfit import combine_garments
 from eslr_jax.pipeline.formats.garment import GarmentFile
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Scene, Trajectory
 
 OUTFITS = ("pants+tshirt", "shorts+dress", "underskirt+skirt", "tank+longsleeve", "pants+skirt")
@@ -89,14 +88,13 @@ def judge(scene: Scene, trajectory: Trajectory) -> dict[str, object]:
     assert trajectory.is_passed is not None
     passed = np.flatnonzero(np.asarray(trajectory.is_passed)[SETTLE_FRAMES:])
     residual = float(np.max(np.asarray(trajectory.residuals)[SETTLE_FRAMES:]))
-    settled = trajectory.positions[SETTLE_FRAMES:]
-    stretches = jax.lax.map(lambda x: principal_stretches(x, cloth)[0].max(), settled)
+    stretch = largest_stretch(Run(scene, lambda frame: (), trajectory), SETTLE_FRAMES)
     return {
         "cloth_body": sum(of_body),
         "cloth_cloth": sum(of_cloth),
         "let_through": passed.tolist(),
         "residual_max": round(residual, 2),
-        "stretch_max": round(float(stretches.max()), 3),
+        "stretch_max": round(stretch, 3),
         "iterations": round(float(np.mean(np.asarray(trajectory.iterations)[SETTLE_FRAMES:])), 1),
         "passed": not (sum(of_body) or sum(of_cloth) or len(passed)) and residual < MOST_RESIDUAL,
     }
