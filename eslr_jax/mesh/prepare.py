@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -16,7 +15,7 @@ from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.geodesic import EmbeddingMode, geodesic_embedding
 from eslr_jax.mesh.surface import compact_groups
 from eslr_jax.mesh.validate import validate_lengths, validate_mesh, validate_orientation
-from eslr_jax.numerics import safe_norm, scatter_corners
+from eslr_jax.numerics import safe_norm, scatter_corners, to_device
 from eslr_jax.types import Garment
 
 
@@ -134,13 +133,6 @@ def pad_alike(garments: Sequence[Garment], bucket: padding.Bucket | None = None)
         bucket = bucket._replace(vertices=bucket.vertices + 1)
     padded = [padding.pad_garment(garment.replace(material=None), bucket) for garment in garments]
     return [to_device(add_coarse_edges(one) if one.coarse is not None else one) for one in padded]
-
-
-def to_device(garment: Garment) -> Garment:
-    """Return a garment with float32, int32 and bool JAX leaves."""
-    dtypes = {"f": np.float32, "i": np.int32, "u": np.int32, "b": np.bool_}
-    # Converted by NumPy: JAX would compile a program for every shape.
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtypes[leaf.dtype.kind])), garment)
 
 
 def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices 3"]) -> Garment:

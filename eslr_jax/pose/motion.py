@@ -12,7 +12,7 @@ import numpy as np
 
 from eslr_jax.errors import ConfigError, MotionError
 from eslr_jax.mesh.surface import prepare_surface
-from eslr_jax.numerics import product
+from eslr_jax.numerics import product, to_device
 from eslr_jax.pose import lbs
 from eslr_jax.pose.joints import find_parts, torso_axes
 from eslr_jax.pose.retarget import ARM_ABDUCTION, abduct_arms, resample
@@ -116,7 +116,7 @@ def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> 
     """
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
     skin = body.rest_positions, body.skin_weights, body.skin_indices, body.pose_directions
-    return _skin_frames(*skin, transforms, jnp.asarray(rotations[:, 1:], jnp.float32)), transforms
+    return _skin_frames(*skin, transforms, np.asarray(rotations[:, 1:], np.float32)), transforms
 
 
 def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
@@ -133,7 +133,7 @@ def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *
         joint_transforms=joint_transforms,
         faces=body.faces,
         is_obstacle=body.is_obstacle,
-        timestep=jnp.float32(1.0 / fps),
+        timestep=to_device(1.0 / fps),
         rest_positions=body.rest_positions,
         surface=obstacle_surface(body),
     )

@@ -126,7 +126,7 @@ def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) 
         raise MotionError(f"can't settle for {num_frames} frames; give 0 or more")
     limbs = None
     if body is not None and begins_at_rest(num_frames, body):
-        pose = np.asarray(poses.joint_transforms[0], np.float64)
+        pose = np.asarray(poses.joint_transforms)[0].astype(np.float64)
         limbs = _limbs_from_rest(body, pose, num_frames - _HELD)
     positions, transforms = _glide((poses.positions, poses.joint_transforms), limbs, num_frames)
     return poses.replace(positions=positions, joint_transforms=transforms)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError
@@ -111,7 +110,7 @@ def prepare_scene(
     planned, poses = _plan(garment, poses, terms, surface)
     stepping = {"integrator": integrator, "substeps": substeps, "starts_at_rest": starts_at_rest}
     given = (garment, poses, worn_material(garment, material), planned)
-    return _build(*given, on_shapes, **stepping, has_pins=bool(np.any(garment.is_pinned)))
+    return _build(*given, on_shapes, **stepping, has_pins=bool(np.any(np.asarray(garment.is_pinned))))
 
 
 def prepare_scenes(
@@ -197,14 +196,14 @@ def _build(
     The body makes room for cloth after `on_shapes`, while programs compile.
     """
     poses = jax.device_get(poses)  # on the host nothing is compiled
-    garment, material, terms = jax.tree.map(jnp.asarray, (garment, material, terms))
-    poses = poses.replace(timestep=jnp.asarray(poses.timestep))
+    garment, material, terms = jax.device_put((garment, material, terms))
+    poses = poses.replace(timestep=jax.device_put(poses.timestep))
 
     def on_body(poses: BodyMotion) -> tuple[Obstacle | None, tuple]:
         body = reached_body(poses, terms)
         first = None if body is None else pad_body(body.replace(positions=body.positions[:1]))
         given = garment.replace(material=None), poses.joint_transforms[:2], poses.timestep, first, terms
-        return body, jax.tree.map(jnp.asarray, given)
+        return body, jax.device_put(given)
 
     body, given = on_body(poses)
     program = find_program(first_state, given, **starting)
@@ -213,7 +212,7 @@ def _build(
     scene = scene_from(program.results, *parts, body=body, pin_targets=pins, substeps=substeps)
     on_shapes(scene)
     body, given = on_body(_cleared(poses, terms))
-    return scene.replace(initial_state=program.wait()(*given), body=jax.tree.map(jnp.asarray, body))
+    return scene.replace(initial_state=program.wait()(*given), body=jax.device_put(body))
 
 
 def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:
@@ -232,7 +231,7 @@ def _check_stepping(integrator: str, substeps: int) -> None:
 def _check(garment: Garment, poses: BodyMotion) -> None:
     """Raise where there is no motion, or where a garment hangs on joints that the body does not have."""
     check_length(poses)
-    last, num_joints = int(np.max(garment.skin_indices)), poses.joint_transforms.shape[1]
+    last, num_joints = int(np.max(np.asarray(garment.skin_indices))), poses.joint_transforms.shape[1]
     if last >= num_joints:  # their weights would be lost
         raise MeshError(
             f"the garment was fitted to another body: it hangs on joint {last}, and this body has {num_joints} "

@@ -85,7 +85,7 @@ def simulate(
     while larger is not None:
         scene = larger
         trajectory, spent = _in_chunks(
-            jax.tree.map(jnp.asarray, params), scene, config, done, pace, on_frames, is_stopping
+            jax.device_put(params), scene, config, done, pace, on_frames, is_stopping
         )
         passes.append(spent)
         larger, kept = enlarge_buffers(scene, trajectory), good_frames(trajectory)
@@ -120,13 +120,13 @@ def _in_chunks(
     held = np.minimum(np.arange(scene.num_frames + chunk), total)
     shared = share_programs(jax.device_get(scene))  # on the host, where it compiles nothing
     inputs = frame_inputs(slice_tracks(shared, held))
-    constant = jax.tree.map(jnp.asarray, _without_frames(shared))
+    constant = jax.device_put(_without_frames(shared))
 
     def part(first: int) -> FrameInput:
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[first : first + chunk]), inputs)
+        return jax.device_put(jax.tree.map(lambda leaf: leaf[first : first + chunk], inputs))
 
     iterations = config.iterations
-    start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else state_at(before, scene))
+    start = jax.device_put(scene.initial_state if before is None else state_at(before, scene))
     begin = 0 if before is None else before.num_frames - 1
     if before is not None and begin >= total:  # nothing is left
         return before, (0.0, 0.0, 0)
@@ -164,7 +164,7 @@ def _in_chunks(
 
 def _slice_frames(trajectory: Trajectory, frames: slice) -> Trajectory:
     """Return some frames of a trajectory, with its status."""
-    return _map_frames(lambda leaf: jnp.asarray(np.asarray(leaf)[frames]), trajectory)
+    return _map_frames(lambda leaf: jax.device_put(np.asarray(leaf)[frames]), trajectory)
 
 
 def _map_frames(function: Callable, trajectory: Trajectory, *before: Trajectory) -> Trajectory:
@@ -184,10 +184,10 @@ def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothStat
     position, velocity = np.asarray(trajectory.positions), np.asarray(trajectory.velocities)
     past = scene.initial_state.past
     if past is not None and frame > 0:
-        before = initial_state(jnp.asarray(position[frame - 1]), jnp.asarray(velocity[frame - 1]))
-        past = past_state(before, jnp.asarray(scene.timestep), np.asarray(trajectory.residuals)[frame])
-    state = initial_state(jnp.asarray(position[frame]), jnp.asarray(velocity[frame]))
-    load = jnp.asarray(np.asarray(trajectory.friction_loads)[frame])
+        before = initial_state(*jax.device_put((position[frame - 1], velocity[frame - 1])))
+        past = past_state(before, jax.device_put(scene.timestep), np.asarray(trajectory.residuals)[frame])
+    state = initial_state(*jax.device_put((position[frame], velocity[frame])))
+    load = jax.device_put(np.asarray(trajectory.friction_loads)[frame])
     number = scene.initial_state.frame + jnp.int32(frame)
     return state.replace(friction_load=load, frame=number, past=past)
 

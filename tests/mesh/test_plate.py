@@ -10,7 +10,7 @@ from known_answers.sheets import cantilever_rigidity, grid, irregular, stiffness
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.mesh.padding import pad_garment
 from eslr_jax.mesh.plate import prepare_plate, rest_corners, warp_directions
-from eslr_jax.mesh.prepare import to_device
+from eslr_jax.numerics import to_device
 from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 
 RIGIDITY = 2e-5  # [N m]

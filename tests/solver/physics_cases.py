@@ -12,7 +12,7 @@ from cloth import make_garment, make_sheet
 from eslr_jax import Material
 from eslr_jax.mesh import topology
 from eslr_jax.mesh.padding import pad_garment
-from eslr_jax.mesh.prepare import to_device
+from eslr_jax.numerics import to_device
 from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Stretch
 from eslr_jax.terms.collision import BodyContact
 from eslr_jax.terms.friction import Rubbing

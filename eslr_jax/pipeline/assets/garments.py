@@ -14,7 +14,8 @@ import numpy as np
 from eslr_jax.errors import ConfigError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.mesh.coarse import add_coarse_edges
-from eslr_jax.mesh.prepare import prepare_garment, to_device
+from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax.numerics import to_device
 from eslr_jax.pipeline.assets.cache import cached, content_key
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
 from eslr_jax.pipeline.assets.motions import load_body

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.files.npz import check_layout, read_arrays
+from eslr_jax.numerics import to_device
 from eslr_jax.pipeline.formats.registry import reader
 from eslr_jax.pose.motion import Motion
 from eslr_jax.types import Body
@@ -55,15 +55,16 @@ def read_body(path: Path, _meshes: str = "") -> Body:
     parents = arrays["parents"].astype(np.int64)
     if parents[0] != -1 or ((parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
         raise AssetError(f"{what}: parents don't come before their children; {remedy}")
-    floats = {key: jnp.asarray(arrays[key], jnp.float32) for key in _BODY if _BODY[key][0] == "f"}
-    return Body(
+    floats = {key: arrays[key] for key in _BODY if _BODY[key][0] == "f"}
+    body = Body(
         **floats,
-        skin_indices=jnp.asarray(arrays["skin_indices"], jnp.int32),
-        faces=jnp.asarray(arrays["faces"], jnp.int32),
-        is_obstacle=jnp.asarray(arrays["obstacle_faces"], bool),
+        skin_indices=arrays["skin_indices"],
+        faces=arrays["faces"],
+        is_obstacle=arrays["obstacle_faces"].astype(bool),
         parents=tuple(map(int, parents)),
         joint_names=tuple(map(str, arrays["joint_names"])),
     )
+    return to_device(body)
 
 
 def read_motion_archive(path: str | Path) -> dict[str, Motion]:

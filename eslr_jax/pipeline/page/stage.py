@@ -90,7 +90,7 @@ def _staged(scene: Scene, material: Material) -> Stage:
         back = back._replace(body=body._replace(start=body.end, end=body.start))
     if scene.pin_targets is not None:
         back = back._replace(pin_targets=scene.pin_targets[:-1])
-    constant = jax.tree.map(jnp.asarray, without_tracks(scene)).replace(num_frames=2)
+    constant = jax.device_put(without_tracks(scene)).replace(num_frames=2)
     # Changed to what it is, so that it has the types of all that it will be changed to.
     return changed(Stage(scene, constant, inputs, back), material, (0.0, 0.0, 0.0), no_hand())
 

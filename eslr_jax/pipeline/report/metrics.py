@@ -26,7 +26,7 @@ class FrameMeasures(NamedTuple):
 
 def measure_frames(positions: Float[Array, "frames vertices 3"], scene: Scene) -> FrameMeasures:
     """Measure every simulated frame of a trajectory of a scene, given positions [m]; frame 0 is the start."""
-    measured = jax.tree.map(jnp.asarray, _measured(positions, scene))
+    measured = jax.device_put(_measured(positions, scene))
     return measures_program(positions, scene).wait()(*measured)
 
 

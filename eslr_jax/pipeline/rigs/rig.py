@@ -7,7 +7,6 @@ import math
 import warnings
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.files.npz import check_layout
 from eslr_jax.mesh.validate import UNITS, check_outward
+from eslr_jax.numerics import to_device
 from eslr_jax.pipeline.formats.mesh import shared_vertices
 from eslr_jax.pipeline.rigs.alignment import LIMBS, align_rests, match_parts, rig_scale
 from eslr_jax.pose.joints import HAND, find_named_parts, find_parts, map_joints
@@ -116,7 +116,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     weights = mesh.skin_weights[vertices]
 
     def lengths(values: NDArray):
-        return jnp.asarray(scale * values, jnp.float32)
+        return scale * values
 
     shapes, joint_shapes = mesh.shape_directions, mesh.joint_shape_directions
     if shapes is None or joint_shapes is None:
@@ -130,19 +130,20 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     is_obstacle = ~is_hand[leading][faces].all(axis=1)
     if not is_obstacle.any():
         raise AssetError(f"body {mesh.name} is hands alone; bind its other meshes to its skeleton")
-    return Body(
+    rigged = Body(
         rest_positions=lengths(mesh.positions[vertices]),
         shape_directions=lengths(shapes[vertices]),
         joint_rest_positions=lengths(skeleton.rest_positions),
         joint_shape_directions=lengths(joint_shapes[order]),
-        skin_weights=jnp.asarray(weights / weights.sum(1, keepdims=True), jnp.float32),
-        skin_indices=jnp.asarray(indices, jnp.int32),
-        faces=jnp.asarray(faces, jnp.int32),
-        is_obstacle=jnp.asarray(is_obstacle),
+        skin_weights=weights / weights.sum(1, keepdims=True),
+        skin_indices=indices,
+        faces=faces,
+        is_obstacle=is_obstacle,
         parents=skeleton.parents,
         joint_names=skeleton.joint_names,
         pose_directions=None if mesh.pose_directions is None else lengths(mesh.pose_directions[vertices]),
     )
+    return to_device(rigged)
 
 
 def _check_mesh(mesh: RiggedMesh) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from eslr_jax.errors import MotionError
 from eslr_jax.mesh.skinning import smooth
 from eslr_jax.mesh.topology import unique_edges
 from eslr_jax.mesh.validate import check_outward
+from eslr_jax.numerics import to_device
 from eslr_jax.pipeline.formats.bundled import UPRIGHT
 from eslr_jax.pipeline.formats.mesh_sequence import MeshSequence
 from eslr_jax.pipeline.rigs.rig import metres_per_unit
@@ -84,18 +84,18 @@ def pose_sequence(
         transforms[frame, :, :, 3] = middle - np.einsum("pab,pb->pa", turned, centers)
     patches = dense.shape[1]
     body = Body(
-        rest_positions=jnp.asarray(rest, jnp.float32),
-        shape_directions=jnp.zeros((len(rest), 3, 0), jnp.float32),
-        joint_rest_positions=jnp.asarray(centers, jnp.float32),
-        joint_shape_directions=jnp.zeros((patches, 3, 0), jnp.float32),
-        skin_weights=jnp.asarray(weights, jnp.float32),
-        skin_indices=jnp.asarray(indices, jnp.int32),
-        faces=jnp.asarray(faces, jnp.int32),
-        is_obstacle=jnp.ones(len(faces), bool),
+        rest_positions=rest,
+        shape_directions=np.zeros((len(rest), 3, 0)),
+        joint_rest_positions=centers,
+        joint_shape_directions=np.zeros((patches, 3, 0)),
+        skin_weights=weights,
+        skin_indices=indices,
+        faces=faces,
+        is_obstacle=np.ones(len(faces), bool),
         parents=(-1,) * patches,
         joint_names=tuple(f"patch{patch}" for patch in range(patches)),
     )
-    moved = (jnp.asarray(values, jnp.float32) for values in (positions, transforms))
+    body, *moved = to_device((body, positions, transforms))
     return body, body_motion(body, *moved, fps=fps)
 
 
