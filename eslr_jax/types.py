@@ -154,7 +154,7 @@ class BodySurface:
     face_blocks: Int[Array, "face_blocks face_block"]  # likewise of all faces
     edges: Int[Array, "surface_edges 2"]  # every edge once
     edge_blocks: Int[Array, "edge_blocks edge_block"]  # likewise of all edges
-    is_boundary: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
+    is_boundary: Bool[Array, " surface_vertices"]  # where the faces end
     vertex_areas: Float[Array, " surface_vertices"]  # a third of the incident areas at rest [m^2]
 
 

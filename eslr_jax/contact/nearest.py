@@ -324,10 +324,10 @@ def _contacts_at(
     )
 
 
-def _is_on_boundary(location: SurfacePoint, surface: BodySurface) -> Bool[Array, " vertices"]:
+def _is_on_boundary(location: SurfacePoint, surface: BodySurface) -> Bool[Array, "*points"]:
     """Return which points lie where the surface ends."""
     corners = surface.is_boundary[surface.faces[location.face]]
-    return sum(jnp.where(corners[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY  # type: ignore[return-value, operator]
+    return sum(jnp.where(corners[..., k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY  # type: ignore[return-value, operator]
 
 
 def approach(
@@ -374,7 +374,7 @@ def is_inside(
     """Return which vertices are inside the body, by the nearest of all its faces.
 
     `find_contacts` looks at few faces. Along a needle it may take one across, behind which everything is. So what
-    it takes to be inside is looked at once more, one vertex at a time.
+    it takes to be inside is looked at once more, one vertex at a time. Where faces end there is no inside.
 
     Args:
         may_be: Vertices to look at.
@@ -401,7 +401,9 @@ def is_inside(
             distance, height = safe_norm(offset, axis=0), jnp.sum(offset * normal, axis=0)
             is_nearest = distance <= jnp.min(distance) + _EQUALLY
             steepest = jnp.argmax(jnp.where(is_nearest, jnp.abs(height), -1.0))
-            return found.at[vertex].set(height[steepest] < 0)
+            weights = tuple(weight[steepest] for weight in (1.0 - u - v, u, v))
+            place = SurfacePoint(steepest, weights, distance[steepest] ** 2)  # type: ignore[arg-type]
+            return found.at[vertex].set((height[steepest] < 0) & ~_is_on_boundary(place, surface))
 
         return jax.lax.fori_loop(0, jnp.sum(may_be), look, jnp.zeros_like(may_be))
 

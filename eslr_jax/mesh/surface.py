@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.mesh.padding import round_up
-from eslr_jax.mesh.topology import face_areas, incidence_table, moved_incidence, unique_edges, vertex_areas
+from eslr_jax.mesh.topology import (
+    face_areas,
+    incidence_table,
+    is_on_boundary,
+    moved_incidence,
+    unique_edges,
+    vertex_areas,
+)
+from eslr_jax.numerics import to_device
 from eslr_jax.types import BodySurface, Obstacle
 
 # Vertices, faces or edges in a group; more make the first level cheaper and the second dearer.
@@ -37,31 +44,30 @@ def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.n
     return np.stack(groups)
 
 
-def prepare_surface(
-    rest_positions: np.ndarray, faces: np.ndarray, *, boundary: np.ndarray | None = None
-) -> BodySurface:
+def prepare_surface(rest_positions: np.ndarray, faces: np.ndarray) -> BodySurface:
     """Build the search tables of a body surface from its vertices in a pose without self-contact [m].
 
-    Only the vertices of the faces to keep are kept. At `boundary` vertices the body goes on with faces that are
-    not kept: cloth beyond them is not in contact.
+    Only the vertices of the faces to keep are kept. Where those end, as at a wrist without its hand, cloth beyond
+    is not in contact.
     """
     vertex_ids, flat = np.unique(faces, return_inverse=True)
     faces = flat.reshape(-1, 3)
     positions = np.asarray(rest_positions, np.float64)[vertex_ids]
     edges = unique_edges(faces)
-    return BodySurface(
-        vertex_ids=jnp.asarray(vertex_ids, jnp.int32),
-        faces=jnp.asarray(faces, jnp.int32),
-        face_incidence=jnp.asarray(incidence_table(faces, len(positions)), jnp.int32),
-        patch_vertices=jnp.asarray(compact_groups(positions, _PATCH_SIZE), jnp.int32),
-        face_blocks=jnp.asarray(compact_groups(positions[faces].mean(axis=1), _PATCH_SIZE), jnp.int32),
-        edges=jnp.asarray(edges, jnp.int32),
-        edge_blocks=jnp.asarray(compact_groups(positions[edges].mean(axis=1), _PATCH_SIZE), jnp.int32),
-        is_boundary=jnp.asarray(np.isin(vertex_ids, [] if boundary is None else boundary)),
-        vertex_areas=jnp.asarray(
-            vertex_areas(face_areas(positions, faces), faces, len(positions)), jnp.float32
-        ),
+    _, place = np.unique(positions, axis=0, return_inverse=True)  # at a seam of its mesh a body does not end
+    place = place.reshape(-1)
+    surface = BodySurface(
+        vertex_ids=vertex_ids,
+        faces=faces,
+        face_incidence=incidence_table(faces, len(positions)),
+        patch_vertices=compact_groups(positions, _PATCH_SIZE),
+        face_blocks=compact_groups(positions[faces].mean(axis=1), _PATCH_SIZE),
+        edges=edges,
+        edge_blocks=compact_groups(positions[edges].mean(axis=1), _PATCH_SIZE),
+        is_boundary=is_on_boundary(place[faces], len(positions))[place],
+        vertex_areas=vertex_areas(face_areas(positions, faces), faces, len(positions)),
     )
+    return to_device(surface)
 
 
 def pad_surface(surface: BodySurface) -> BodySurface:

@@ -232,10 +232,10 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
 
 
 def is_on_boundary(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> Bool[np.ndarray, " vertices"]:
-    """Return which vertices lie on the boundary of a manifold mesh."""
-    starts, _, _ = half_edges(faces)
+    """Return which vertices have an edge with a single face."""
+    edges, _, counts = undirected_edges(faces)
     result = np.zeros(num_vertices, bool)
-    result[starts[twin_half_edges(faces) < 0]] = True
+    result[edges[counts == 1]] = True
     return result
 
 

@@ -152,8 +152,7 @@ def surface_near(is_near: np.ndarray, body: Body | BodyMotion) -> BodySurface | 
     is_kept = is_near[faces].any(axis=1)
     if not is_kept.any():
         return None
-    boundary = np.intersect1d(faces[is_kept], faces[~is_kept])
-    return prepare_surface(np.asarray(body.rest_positions), faces[is_kept], boundary=boundary)
+    return prepare_surface(np.asarray(body.rest_positions), faces[is_kept])
 
 
 def looseness(garment: Garment, body: Body | BodyMotion) -> np.ndarray:

@@ -37,8 +37,8 @@ def _turned(scene: Scene, matrix: np.ndarray) -> Scene:
     body = body.replace(positions=body.positions @ turn)
     if np.linalg.det(matrix) < 0:  # normals must still point out
         garment = _mirrored(garment, turn)
-        faces, boundary = np.asarray(body.surface.faces)[:, ::-1], np.flatnonzero(body.surface.is_boundary)
-        body = body.replace(surface=prepare_surface(body.positions[0], faces, boundary=boundary))
+        faces = np.asarray(body.surface.faces)[:, ::-1]
+        body = body.replace(surface=prepare_surface(body.positions[0], faces))
     state = state.replace(position=state.position @ turn, velocity=state.velocity @ turn)
     return scene.replace(garment=garment, initial_state=state, body=body)
 

@@ -191,13 +191,16 @@ def test_beyond_the_boundary_of_a_part_nothing_is_touched(sphere):
     """The tangent plane at the boundary would push cloth there by as much as it hangs below it."""
     mesh, _, _ = sphere
     is_upper = mesh.triangles_center[:, 1] > 0
-    upper, lower = mesh.faces[is_upper], mesh.faces[~is_upper]
-    surface = prepare_surface(mesh.vertices, upper, boundary=np.intersect1d(upper, lower))
+    surface = prepare_surface(mesh.vertices, mesh.faces[is_upper])
     vertices = jnp.asarray(mesh.vertices, jnp.float32)[surface.vertex_ids]
     query = jnp.array([[0.24, -0.05, 0.0], [0.24, 0.1, 0.0]])
     contacts = find(query, vertices, vertices, surface)
     np.testing.assert_array_equal(contacts.is_near, [False, True])
     assert contacts.distances[0] > 0
+    inside = is_inside(
+        jnp.ones(2, bool), query, vertices, surface
+    )  # the first is below the last faces' plane
+    np.testing.assert_array_equal(inside, [False, True])
 
 
 def winding(query, corners):
