@@ -42,9 +42,9 @@ _LINEAR_STALL = 1e-2  # residual above which the derivative is refused
 # Of a frame that is solved and corrected, at most. Two or three do; a sheet that crumples in steps of 0.1 s takes
 # up to seven.
 _PASSES = 8
-# [weights] Force with which a frame is not yet solved, whatever its tolerance, and which BDF2 does not carry on.
-# Within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15.
-MOST_RESIDUAL = 5.0
+# [weights] Force with which a frame is not yet solved, whatever its tolerance. Within 1 % of the optimum torn
+# cloth leaves 3, a T-shirt 0.15.
+_MOST_RESIDUAL = 5.0
 
 
 def lower_point(reached: Point, previous: Point) -> Point:
@@ -120,7 +120,7 @@ def _solve(
     memory: int,
     is_corrected: bool,
 ) -> Solved:
-    most_force = MOST_RESIDUAL * weight_norm(problem)
+    most_force = _MOST_RESIDUAL * weight_norm(problem)
     stop = Stop(*limits, start.inertial_energy, most_force=most_force)
     if not is_corrected:
         return Solved(_minimum(problem, start, stop, memory), problem.data)
