@@ -197,9 +197,8 @@ def test_beyond_the_boundary_of_a_part_nothing_is_touched(sphere):
     contacts = find(query, vertices, vertices, surface)
     np.testing.assert_array_equal(contacts.is_near, [False, True])
     assert contacts.distances[0] > 0
-    inside = is_inside(
-        jnp.ones(2, bool), query, vertices, surface
-    )  # the first is below the last faces' plane
+    deeper = 0.9 * query  # the first is below the last faces' plane, and beyond them
+    inside = is_inside(jnp.ones(2, bool), deeper, vertices, surface)
     np.testing.assert_array_equal(inside, [False, True])
 
 
