@@ -28,8 +28,8 @@ from eslr_jax.terms.worn import Worn, looseness, skinned_frames, surface_near, w
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, Obstacle, Scene
 
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
-# Vertices of a garment whose start is not compiled briefly, see `find_program`: that of a dress at 4k would take 0.45
-# in place of 0.08 s, in every run.
+# Vertices of a garment whose start is not compiled briefly, see `find_program`: that of a dress at 4k would take
+# 0.45 in place of 0.08 s, in every run.
 _LARGE = 3000
 
 
