@@ -39,7 +39,8 @@ class Program:
     def __init__(self, lowered: jax.stages.Lowered, results: Any, options: tuple):
         self.results = results
         """Shapes of what it returns."""
-        self._compile = partial(lowered.compile, dict(options))
+        self._lowered = lowered
+        self._options = dict(options)
         self._compiled: Future[jax.stages.Compiled] | None = None
 
     def begin(self) -> None:
@@ -55,6 +56,11 @@ class Program:
             self._compiled = compiled
         self._compiled.result()
         return self
+
+    def _compile(self) -> jax.stages.Compiled:
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # of a release that does not know an option
+            return self._lowered.compile(self._options)
+        return self._lowered.compile()
 
     def __call__(self, *arguments: Any) -> Any:
         """Return the function's results for arrays of its shapes."""
