@@ -89,7 +89,7 @@ def test_penetration_and_stretch_name_frame_part_and_vertex(worn):
     assert any("mm inside the body, frame 2 (0.07 s), part scarf, vertex 27" in text for text in warnings)
     assert any("cloth is stretched by" in text and "part scarf" in text for text in warnings)
     (advised,) = (text for text in describe_report(report | {"substeps": 2}).warnings if "stretched" in text)
-    assert advised.endswith("vertex 0; try --substeps 4")
+    assert advised.endswith("vertex 0; try --substeps 8")
 
 
 def rolled(flat):

@@ -82,7 +82,7 @@ class Options:
     # cloth loses two thirds of its energy in a second. The default is bdf2, or euler for a network alone,
     # which was trained with it.
     integrator: Literal["euler", "bdf2"] | None = None
-    # Number of shorter steps per frame; with 2, limbs that move fast take less cloth along. The iterations
+    # Number of shorter steps per frame; with 4, limbs that move fast take less cloth along. The iterations
     # are those of each substep.
     substeps: int = 1
     # How contact is kept. With strict nothing passes through cloth, neither the body nor other cloth. With fast,

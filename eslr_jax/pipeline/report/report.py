@@ -314,8 +314,9 @@ def describe_report(report: dict[str, Any]) -> Words:
     most, largest = report["p99_principal_stretch"], report["max_principal_stretch"]
     text = f"cloth is stretched by {100 * (most - 1):.0f} % (99 % of it), {100 * (largest - 1):.0f} % at most"
     if most > _STRETCH or largest > _TORN:
-        # Limbs that move far in a frame catch cloth: on a kick trousers are stretched half as far in two steps.
-        more = f"; try --substeps {2 * report['substeps']}" if "substeps" in report else ""
+        # Limbs that move far in a frame take cloth along: trousers on a kick to 2 to 9 times their length, and in
+        # four steps to 1.5 times.
+        more = f"; try --substeps {4 * report['substeps']}" if "substeps" in report else ""
         warnings.append(f"{text}, {_where(report['worst_stretch'])}{more}")
     else:
         good.append(text)
