@@ -258,6 +258,8 @@ class Trajectory:
     demands: dict[str, Int[Array, " frames"]] = struct.field(default_factory=dict)
     # Frames in which something may have passed through cloth; None where no term watches that.
     is_passed: Bool[Array, " frames"] | None = None
+    # Equal parts in which each frame was simulated, see `simulate`; None: as many as the scene says.
+    substeps: Int[Array, " frames"] | None = None
 
     @property
     def num_frames(self) -> int:

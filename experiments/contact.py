@@ -7,7 +7,7 @@
 All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every third
 frame a referee counts pairs of triangles that intersect, of cloth with the body and of cloth with cloth. A start
 fails where there is one, where the simulator let something through, or where a frame ends with a force of 20
-weights. How far the most stretched face goes is kept, too. An outfit is written from the inside outwards; a
+weights. How far the most stretched face goes is kept, too, and how many frames were simulated in several steps. An outfit is written from the inside outwards; a
 `skirt` and an `underskirt` are a dress without its top.
 
 Rows of contact.json stay until they are measured again.
@@ -88,6 +88,7 @@ def judge(scene: Scene, trajectory: Trajectory) -> dict[str, object]:
     assert trajectory.is_passed is not None
     passed = np.flatnonzero(np.asarray(trajectory.is_passed)[SETTLE_FRAMES:])
     residual = float(np.max(np.asarray(trajectory.residuals)[SETTLE_FRAMES:]))
+    refined = int(np.sum(np.asarray(trajectory.substeps)[SETTLE_FRAMES:] > scene.substeps))
     stretch = largest_stretch(Run(scene, lambda frame: (), trajectory), SETTLE_FRAMES)
     return {
         "cloth_body": sum(of_body),
@@ -95,6 +96,7 @@ def judge(scene: Scene, trajectory: Trajectory) -> dict[str, object]:
         "let_through": passed.tolist(),
         "residual_max": round(residual, 2),
         "stretch_max": round(stretch, 3),
+        "refined": refined,
         "iterations": round(float(np.mean(np.asarray(trajectory.iterations)[SETTLE_FRAMES:])), 1),
         "passed": not (sum(of_body) or sum(of_cloth) or len(passed)) and residual < MOST_RESIDUAL,
     }

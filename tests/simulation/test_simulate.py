@@ -344,3 +344,13 @@ def test_the_first_bad_frame_is_a_row_of_the_trajectory(scene):
     ended = simulate(None, scene.replace(initial_state=late), config=SOLVER, raises=False).trajectory
     assert int(ended.first_bad_frame) == 1
     assert good_frames(ended).num_frames == 1
+
+
+def test_frames_that_tear_cloth_are_simulated_again_in_four_steps():
+    scene = prepare_scene(square(is_pinned=np.array([0, 7])), drifting_ball(13), terms=FAST)
+    pins = scene.pin_targets.at[5:, 7].add(0.4)
+    torn = scene.replace(pin_targets=pins)
+    trajectory = simulate(None, torn, config=SOLVER).trajectory
+    assert np.asarray(trajectory.substeps).tolist() == [1] + 10 * [4] + 2 * [1]
+    parted = simulate(None, torn.replace(substeps=4), config=SOLVER).trajectory
+    np.testing.assert_array_equal(trajectory.positions[:11], parted.positions[:11])
