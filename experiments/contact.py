@@ -7,8 +7,8 @@
 All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every third
 frame a referee counts pairs of triangles that intersect, of cloth with the body and of cloth with cloth. A start
 fails where there is one, where the simulator let something through, or where a frame ends with a force of 20
-weights. How far the most stretched face goes is kept, too, and how many frames were simulated in several steps. An outfit is written from the inside outwards; a
-`skirt` and an `underskirt` are a dress without its top.
+weights. How far the most stretched face goes is kept, too, and how many frames were simulated in several steps.
+An outfit is written from the inside outwards; a `skirt` and an `underskirt` are a dress without its top.
 
 Rows of contact.json stay until they are measured again.
 """

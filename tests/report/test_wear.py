@@ -90,6 +90,7 @@ def test_penetration_and_stretch_name_frame_part_and_vertex(worn):
     assert any("cloth is stretched by" in text and "part scarf" in text for text in warnings)
     (advised,) = (text for text in describe_report(report | {"substeps": 2}).warnings if "stretched" in text)
     assert advised.endswith("vertex 0; try --substeps 8")
+    assert "10 frames were simulated" in describe_report(report | {"refined_frames": 10}).good[-1]
 
 
 def rolled(flat):

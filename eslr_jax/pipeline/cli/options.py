@@ -82,8 +82,8 @@ class Options:
     # cloth loses two thirds of its energy in a second. The default is bdf2, or euler for a network alone,
     # which was trained with it.
     integrator: Literal["euler", "bdf2"] | None = None
-    # Number of shorter steps per frame; with 4, limbs that move fast take less cloth along. The iterations
-    # are those of each substep.
+    # Number of shorter steps per frame; with 4, limbs that move fast take less cloth along. Frames that tear
+    # cloth are simulated in 4 in any case. The iterations are those of each substep.
     substeps: int = 1
     # How contact is kept. With strict nothing passes through cloth, neither the body nor other cloth. With fast,
     # in half the time, vertices of the cloth keep off the body; skin may show between them, and layers of
