@@ -43,7 +43,7 @@ def simulate_batch(
     """Simulate garment i on motion i for every i; scenes of like size share one compiled rollout.
 
     Garments are padded to the bucket of their vertex count, and those of one bucket are simulated together, see
-    `simulate_scenes`.
+    `simulate_scenes`. Frames that tear cloth are left as they are, other than by `simulate`.
 
     Args:
         params: A network, or None.
