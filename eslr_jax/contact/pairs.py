@@ -129,7 +129,7 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
 
     A direction that separates two convex primitives at both ends of straight motions separates them all the way:
     heights along it change linearly. So a way is cut into sections, and each is tried with the normals at its two
-    ends. Pairs that come very near may be taken for such that meet.
+    ends, and their mean. Pairs that come very near may be taken for such that meet.
     """
     side = signs(is_edge)
 
@@ -144,7 +144,9 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
         is_first = number == 0
         least = jnp.where(is_first, _LEAST * jnp.minimum(near.distance, GAP), course.least)
         is_parted = is_first
-        for along in (course.normal, normal):
+        # Edges that slide past each other are seen from two sides: what parts them all the way lies between.
+        between: Vector3 = tuple(0.5 * (a + b) for a, b in zip(course.normal, normal, strict=True))  # type: ignore[assignment]
+        for along in (course.normal, normal, between):
             gaps = [gap_along(along, places, side) for places in (course.corners, corners)]
             is_parted = is_parted | (jnp.minimum(*gaps) >= least)
         is_parted = is_parted & ((number < _SECTIONS) | (near.distance >= FLOOR))
