@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.triangle import point_triangle
-from eslr_jax.numerics import Vector3, dot3, sub3
+from eslr_jax.numerics import Vector3, cross3, dot3, sub3
 
 GAP = 1e-4  # [m] within which pairs are looked for
 # [m] that pushed pairs are left. It is far more than they need, since pushes of many pairs are averaged.
@@ -129,7 +129,8 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
 
     A direction that separates two convex primitives at both ends of straight motions separates them all the way:
     heights along it change linearly. So a way is cut into sections, and each is tried with the normals at its two
-    ends, and their mean. Pairs that come very near may be taken for such that meet.
+    ends, their mean, and what stands across both edges or the face. Pairs that come very near may be taken for
+    such that meet.
     """
     side = signs(is_edge)
 
@@ -144,9 +145,10 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
         is_first = number == 0
         least = jnp.where(is_first, _LEAST * jnp.minimum(near.distance, GAP), course.least)
         is_parted = is_first
-        # Edges that slide past each other are seen from two sides: what parts them all the way lies between.
+        # Edges that slide past each other are seen from two sides: what parts them all the way lies between, or
+        # across both of them.
         between: Vector3 = tuple(0.5 * (a + b) for a, b in zip(course.normal, normal, strict=True))  # type: ignore[assignment]
-        for along in (course.normal, normal, between):
+        for along in (course.normal, normal, between, _across(corners, near.offset, is_edge)):
             gaps = [gap_along(along, places, side) for places in (course.corners, corners)]
             is_parted = is_parted | (jnp.minimum(*gaps) >= least)
         is_parted = is_parted & ((number < _SECTIONS) | (near.distance >= FLOOR))
@@ -159,6 +161,16 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
     nowhere = (nothing, nothing, nothing)
     first = _Course(start, nowhere, nothing, jnp.ones(nothing.shape, bool), nowhere)
     return jax.lax.fori_loop(0, _SECTIONS + 1, section, first)
+
+
+def _across(p: tuple[Vector3, ...], offset: Vector3, is_edge: bool) -> Vector3:
+    """Return the direction across both edges, or across the face, towards the first; zero where there is none."""
+    first, second = (sub3(p[1], p[0]), sub3(p[3], p[2])) if is_edge else (sub3(p[2], p[1]), sub3(p[3], p[1]))
+    across = cross3(first, second)
+    squared = dot3(across, across)
+    scale = jnp.where(squared > 0, jax.lax.rsqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    scale = jnp.where(dot3(across, offset) < 0, -scale, scale)
+    return tuple(scale * part for part in across)  # type: ignore[return-value]
 
 
 def _heights(normal: Vector3, p: tuple[Vector3, ...]) -> list[Array]:
