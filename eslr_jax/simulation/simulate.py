@@ -144,15 +144,18 @@ def _in_chunks(
     begin = 0 if before is None else before.num_frames - 1
     if before is not None and begin >= total:  # nothing is left
         return before, (0.0, 0.0, 0)
+    if before is not None and before.substeps is None:  # of `rollout`
+        before = before.replace(substeps=np.full(before.num_frames, scene.substeps, np.int32))
     state, done, substeps, seconds, compile_s = start, [], [], 0.0, 0.0
+    parts = scene.substeps if before is None else int(before.substeps[-1])
+    can_part = config.iterations > 0 and scene.substeps < _PARTS
     for first in range(begin, total, chunk):
         bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
         end, frames, waited, took = run(constant, first, state)
-        parts, can_part = scene.substeps, config.iterations > 0 and scene.substeps < _PARTS
-        begun, reached = (_largest_stretch(scene, x) for x in (state.position, frames.positions))
-        # Cloth that begins torn comes out of that in one step as well.
-        is_new = begun < _TORN or substeps[-1:] == [_PARTS]
-        if can_part and int(end.status) == Status.OK and is_new and reached > _TORN:
+        was_parted, parts = parts > scene.substeps, scene.substeps
+        is_torn = can_part and int(end.status) == Status.OK and _is_torn(scene, frames.positions)
+        # Cloth that begins torn comes out of that in one step as well, but not where it tears on.
+        if is_torn and (was_parted or not _is_torn(scene, state.position)):
             parts = _PARTS
             end, frames, *again = run(constant.replace(substeps=parts), first, state)
             waited, took = waited + again[0], took + again[1]
@@ -180,11 +183,11 @@ def _in_chunks(
     return trajectory, (compile_s, seconds, chunk * len(done))
 
 
-def _largest_stretch(scene: Scene, positions: Float[Array, "*frames vertices 3"]) -> float:
-    """Return how many times its rest length the longest of the edges between two faces is (host)."""
+def _is_torn(scene: Scene, positions: Float[Array, "*frames vertices 3"]) -> bool:
+    """Return whether an edge between two faces is longer than `_TORN` times its rest length (host)."""
     is_real = (lengths := np.asarray(scene.garment.hinge_rest_lengths)) > 0
     ends = np.moveaxis(np.asarray(positions)[..., np.asarray(scene.garment.hinges)[is_real, :2], :], -2, 0)
-    return float(np.max(np.linalg.norm(ends[1] - ends[0], axis=-1) / lengths[is_real], initial=0.0))
+    return bool(np.any(np.linalg.norm(ends[1] - ends[0], axis=-1) > _TORN * lengths[is_real]))
 
 
 def _slice_frames(trajectory: Trajectory, frames: slice) -> Trajectory:

@@ -354,3 +354,14 @@ def test_frames_that_tear_cloth_are_simulated_again_in_four_steps():
     assert np.asarray(trajectory.substeps).tolist() == [1] + 12 * [4]
     parted = simulate(None, torn.replace(substeps=4), config=SOLVER).trajectory
     np.testing.assert_array_equal(trajectory.positions, parted.positions)
+    stopped = simulate(None, torn, config=SOLVER, is_stopping=lambda: True).trajectory
+    resumed = simulate(None, torn, config=SOLVER, done=stopped).trajectory
+    np.testing.assert_array_equal(resumed.substeps, trajectory.substeps)
+    np.testing.assert_array_equal(resumed.positions, trajectory.positions)
+
+
+def test_it_goes_on_from_a_rollout(scene):
+    done = rollout_scene(None, first_frames(scene, 5), SOLVER)
+    trajectory = simulate(None, scene, config=SOLVER, done=done).trajectory
+    assert np.asarray(trajectory.substeps).tolist() == 14 * [1]
+    np.testing.assert_array_equal(trajectory.positions[:5], done.positions)
