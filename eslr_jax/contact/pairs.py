@@ -167,9 +167,8 @@ def _across(p: tuple[Vector3, ...], offset: Vector3, is_edge: bool) -> Vector3:
     """Return the direction across both edges, or across the face, towards the first; zero where there is none."""
     first, second = (sub3(p[1], p[0]), sub3(p[3], p[2])) if is_edge else (sub3(p[2], p[1]), sub3(p[3], p[1]))
     across = cross3(first, second)
-    squared = dot3(across, across)
-    scale = jnp.where(squared > 0, jax.lax.rsqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
-    scale = jnp.where(dot3(across, offset) < 0, -scale, scale)
+    length = jnp.sqrt(dot3(across, across))
+    scale = jnp.sign(dot3(across, offset)) / jnp.where(length > 0, length, 1.0)
     return tuple(scale * part for part in across)  # type: ignore[return-value]
 
 

@@ -13,6 +13,7 @@ from eslr_jax.contact import lists, pairs
 from eslr_jax.mesh.surface import prepare_surface
 
 ROWS = 2048
+EMPTY = pairs.Rows(jnp.zeros((4, pairs.CHUNK), jnp.int32), jnp.int32(0))
 KINDS = pytest.mark.parametrize("is_edge", [False, True], ids=["faces", "edges"])
 find_pairs = jax.jit(lists.find_pairs, static_argnums=2)
 pushed_apart = jax.jit(pairs.pushed_apart, static_argnums=4)
@@ -29,8 +30,7 @@ def random_rows(is_edge, scale=0.02):
     x = (np.random.default_rng(0).normal(size=(4 * ROWS, 3)) * scale).astype(np.float32)
     ids = np.arange(4 * ROWS, dtype=np.int32).reshape(4, ROWS)
     rows = pairs.Rows(jnp.asarray(ids), jnp.int32(ROWS))
-    empty = pairs.Rows(jnp.zeros((4, pairs.CHUNK), jnp.int32), jnp.int32(0))
-    return pairs.Pairs(empty, rows) if is_edge else pairs.Pairs(rows, empty), ids, x
+    return pairs.Pairs(EMPTY, rows) if is_edge else pairs.Pairs(rows, EMPTY), ids, x
 
 
 def toolkit(is_edge):
@@ -104,9 +104,8 @@ def test_edges_that_slide_past_each_other_are_not_pushed():
     """By 34 mm a frame, 2 mm apart: a fast sheet on a slope caught on every edge of the ground."""
     x = np.float32([[-0.017, 0.002, -0.02], [-0.017, 0.002, 0.02], [0, 0, -0.1], [0, 0, 0.1]])
     step = np.float32([[0.034, 0, 0], [0.034, 0, 0], [0, 0, 0], [0, 0, 0]])
-    empty = pairs.Rows(jnp.zeros((4, pairs.CHUNK), jnp.int32), jnp.int32(0))
-    edges = empty._replace(ids=empty.ids.at[:, 0].set(jnp.arange(4)), count=jnp.int32(1))
-    ends, lack = pushed_apart(columns(x), columns(x + step), pairs.Pairs(empty, edges), jnp.ones(4, bool), 60)
+    edges = EMPTY._replace(ids=EMPTY.ids.at[:, 0].set(jnp.arange(4)), count=jnp.int32(1))
+    ends, lack = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), jnp.ones(4, bool), 60)
     assert float(lack) == 0
     np.testing.assert_array_equal(np.stack(ends, axis=1), x + step)
 

@@ -62,6 +62,7 @@ def trajectory_report(
         most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
         any, of every tenth simulated frame and the last; None where self-contact is not modelled. `let_through`
         are the frames in which something may have passed through cloth; None where contact is not strict.
+        `refined_frames` are those that `simulate` took again in smaller steps; None where it did not simulate.
     """
     measures = jax.device_get(measure_frames(trajectory.positions, scene))
     trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
@@ -81,7 +82,6 @@ def trajectory_report(
             worst = _place(int(frame) + 1, int(np.flatnonzero(is_real)[column]), scene, parts)
     stretched = int(np.argmax(measures.max_stretch)) + 1
     torn = int(np.asarray(scene.garment.faces)[stretches(stretched).argmax(), 0])
-    parts_of_frames = trajectory.substeps
     several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
     return {
         "finite": bool(np.isfinite(positions).all()),
@@ -101,7 +101,7 @@ def trajectory_report(
         "garments": None if several is None else _garments(trajectory, scene, depth, several),
         **_crossings(trajectory, scene, parts),
         "let_through": None if trajectory.is_passed is None else int(np.sum(trajectory.is_passed)),
-        "refined_frames": None if parts_of_frames is None else int(np.sum(parts_of_frames > scene.substeps)),
+        "refined_frames": None if (own := trajectory.substeps) is None else int(np.sum(own > scene.substeps)),
     }
 
 
