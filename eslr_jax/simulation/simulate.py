@@ -144,10 +144,13 @@ def _in_chunks(
     begin = 0 if before is None else before.num_frames - 1
     if before is not None and begin >= total:  # nothing is left
         return before, (0.0, 0.0, 0)
-    if before is not None and before.substeps is None:  # of `rollout`
-        before = before.replace(substeps=np.full(before.num_frames, scene.substeps, np.int32))
+    parts = scene.substeps
+    if before is not None:
+        known = before.substeps
+        if known is None:  # of `rollout`
+            known = np.full(before.num_frames, parts, np.int32)
+        before, parts = before.replace(substeps=known), int(known[-1])
     state, done, substeps, seconds, compile_s = start, [], [], 0.0, 0.0
-    parts = scene.substeps if before is None else int(before.substeps[-1])
     can_part = config.iterations > 0 and scene.substeps < _PARTS
     for first in range(begin, total, chunk):
         bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
