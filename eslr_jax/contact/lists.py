@@ -58,6 +58,12 @@ def joint_meshes(garment: Garment, surface: BodySurface | None, *, has_layers: b
     return Meshes(*primitives, has_layers=has_layers)
 
 
+def without_body_faces(meshes: Meshes) -> Meshes:
+    """Return meshes in which nothing is over a face of the body."""
+    faces, count = meshes.faces, meshes.faces.num_cloth
+    return meshes.replace(faces=faces.replace(blocks=faces.blocks[:count]))  # type: ignore[attr-defined]
+
+
 def _joined(cloth: tuple, body: tuple | None, num_vertices: int) -> Primitives:
     corners, is_real, blocks = cloth
     if body is None:
@@ -134,20 +140,22 @@ def _find_kind(
     """Return pairs of one kind, and how many there are, which may be more than the rows."""
     own, others = (_boxes(one, motion) for one in (first, second))
     close = _close_groups(first, second, own, others, is_edge, has_layers)
-    members = _table(first.blocks, own)
-    table = _table(second.blocks, others).transpose(2, 1, 0)  # [members, numbers, blocks]
+    members = _table(first, own)
+    table = _table(second, others).transpose(2, 1, 0)  # [members, numbers, blocks]
 
     def words_of(group: Array, other: Array) -> Array:
-        return _candidates(members[group], other, table)
+        words = _candidates(members[group], other, table)
+        if not is_edge:
+            return words
+        # Within a group, each couple once: of row i the bits above i.
+        later = jnp.left_shift(jnp.int32(-2), jnp.arange(words.shape[1], dtype=jnp.int32))
+        return words & jnp.where((group == other)[:, None], later, -1)
 
     def test(found, candidates: Candidates):
         (group, other), (row, column) = candidates.groups, candidates.members
         one, two = first.blocks[group, row], second.blocks[other, column]
         ids = jnp.concatenate([first.corners[:, one], second.corners[:, two]])
-        is_pair = _may_meet(ids, is_edge, motion) & candidates.is_used
-        if is_edge:
-            is_pair = is_pair & ((group != other) | (one < two))  # within a group, each couple once
-        return append(*found, (ids,), is_pair)
+        return append(*found, (ids,), _may_meet(ids, is_edge, motion) & candidates.is_used)
 
     nothing = jnp.zeros((4, rows), jnp.int32)
     (ids,), count = test_candidates(close, words_of, test, ((nothing,), jnp.int32(0)))
@@ -184,17 +192,26 @@ def _ranges(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array,
     return jnp.max(jnp.stack(ends)[:, blocks], axis=2)
 
 
-def _table(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array, "blocks numbers members"]:
-    """Return the boxes of the members of groups; copies have no size."""
+_NUMBERS = 9  # of a box
+
+
+def _table(primitives: Primitives, boxes: _Boxes) -> Float[Array, "blocks numbers members"]:
+    """Return the boxes of the members of groups, with their corners behind them; copies have no size."""
+    blocks = primitives.blocks
     is_copy = jnp.pad(blocks[:, 1:] == blocks[:, :-1], ((0, 0), (1, 0)))
     sizes = [jnp.where(is_copy, -jnp.inf, part[blocks]) for part in boxes.size]
-    return jnp.stack([*(part[blocks] for part in (*boxes.middle, *boxes.half)), *sizes], axis=1)
+    places = [part[blocks] for part in (*boxes.middle, *boxes.half)]
+    corners = [corner[blocks].astype(places[0].dtype) for corner in primitives.corners]  # exact below 2^24
+    return jnp.stack([*places, *sizes, *corners], axis=1)
 
 
 def _candidates(
     rows: Float[Array, "pairs numbers rows"], others: Int[Array, " pairs"], table: Array
 ) -> Int[Array, "pairs rows"]:
-    """Return for every primitive of a group which members of another its box meets on the way, as bits."""
+    """Return for every primitive of a group which members of another its box meets on the way, as bits.
+
+    Those with which it shares a vertex don't count.
+    """
 
     def add_member(k: Array, words: Array) -> Array:
         member = table[k][:, others][:, :, None]
@@ -202,6 +219,9 @@ def _candidates(
         for axis in range(3):
             gap = jnp.abs(rows[:, axis] - member[axis]) - jnp.abs(rows[:, 3 + axis] - member[3 + axis])
             is_met = is_met & (gap < rows[:, 6 + axis] + member[6 + axis])
+        for own in range(_NUMBERS, rows.shape[1]):
+            for other in range(_NUMBERS, member.shape[0]):
+                is_met = is_met & (rows[:, own] != member[other])
         return words | jnp.where(is_met, jnp.left_shift(jnp.int32(1), k), 0)
 
     # In a loop: XLA would gather the members anew for every row in a longer function.
@@ -211,7 +231,7 @@ def _candidates(
 
 
 def _may_meet(ids: Int[Array, "corners rows"], is_edge: bool, motion: Motion) -> Bool[Array, " rows"]:
-    """Return which pairs the normal half way does not part all the way; those that share a vertex don't count."""
+    """Return which pairs the normal half way does not part all the way."""
     p, half, side = corners_of(motion.middle, ids), corners_of(motion.half, ids), signs(is_edge)
     near = closest(p, is_edge)
     ends = [
@@ -219,11 +239,8 @@ def _may_meet(ids: Int[Array, "corners rows"], is_edge: bool, motion: Motion) ->
         for sign in (-1.0, 1.0)
     ]
     gap = jnp.minimum(*(gap_along(near.normal, corners, side) for corners in ends))  # type: ignore[arg-type]
-    shares_one = functools.reduce(
-        jnp.logical_or, [ids[a] == ids[b] for a in range(4) for b in range(a) if side[a] != side[b]]
-    )
     balls = [
         functools.reduce(jnp.maximum, [motion.radius[ids[k]] for k in range(4) if side[k] == s])
         for s in (1, -1)
     ]
-    return ~shares_one & (gap < GAP + balls[0] + balls[1])
+    return gap < GAP + balls[0] + balls[1]

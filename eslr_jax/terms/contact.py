@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.ground import still_contacts
-from eslr_jax.contact.lists import Meshes, Motion, find_pairs, joint_meshes
+from eslr_jax.contact.lists import Meshes, Motion, find_pairs, joint_meshes, without_body_faces
 from eslr_jax.contact.nearest import CLEARANCE, clear_of_body, is_inside
 from eslr_jax.contact.pairs import CHUNK, closest, corners_of
 from eslr_jax.contact.ways import move_clear
@@ -26,6 +26,7 @@ from eslr_jax.numerics import (
     safe_normalize,
     segment_sum,
     sub3,
+    true_rows,
     vertex_normals,
 )
 from eslr_jax.terms.collision import BodyContact, Collision, collision_energies, penetration
@@ -46,9 +47,10 @@ from eslr_jax.types import BodyMotion, BodySurface, Garment, Obstacle, Scene
 _GROWTH = 16e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
 _ROWS = 8  # per vertex of the cloth, of the tables that a scene begins with; a T-shirt needs one, a dress two
 _HEADROOM = 1.5  # of larger tables
-# For pairs that are near at the start a table has one row in so many, or the least number. A T-shirt at 4k needs
-# one in 100.
+# Pairs that have an energy have a table of one row in so many, or of the least number: a T-shirt needs one in 50
+# to 40, a dress one in 50. The tables in which they are looked for have so many times its rows, for the rest.
 _NEAR_SHARE, _LEAST_NEAR = 32, 256
+_LOOKED_AT = 4
 # [m] from which pairs are near. It is more than the thickness, so that those that repel each other in one frame
 # are still known in the next; less for the body, off which its own term keeps vertices.
 _NEAR_CLOTH, _NEAR_BODY = 4e-3, 1.5e-3
@@ -148,7 +150,7 @@ class Meetings(NamedTuple):
     start: Float[Array, "all_vertices 3"]  # of `_begun`
     near: NearPairs
     held: BodyContact  # with planes across the pushes of vertices, which keep them where they were pushed to
-    most_near: Int[Array, ""]  # that the fuller table of them would have needed
+    most_near: Int[Array, ""]  # rows that their table would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
     is_passed: Bool[Array, ""] | bool = False
     most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
@@ -251,17 +253,24 @@ class Contact(Term):
         radius = jnp.where(is_cloth, half, _NEAR_BODY - half).astype(start.dtype)
         still = jax.tree.map(jnp.zeros_like, x)
         motion = jax.lax.stop_gradient(Motion(x, still, radius))
-        found = find_pairs(motion, self._meshes(problem.garment, problem.body), self._near_rows(count))
+        # A vertex over the body is `Collision`'s, which knows what is near at t.
+        meshes = without_body_faces(self._meshes(problem.garment, problem.body))
+        rows = self._near_rows(count)
+        found = find_pairs(motion, meshes, _LOOKED_AT * rows)
         stiffness = self.stiffness * contact_excess(problem.material)
         kinds = []
-        for rows, is_edge in found.pairs.kinds:
-            here, there = corners_of(x, rows.ids), corners_of(y, rows.ids)
-            kinds.append(self._near(rows.ids, rows.count, is_edge, here, there, stiffness, problem))
+        for pairs, is_edge in found.pairs.kinds:
+            here, there = corners_of(x, pairs.ids), corners_of(y, pairs.ids)
+            kinds.append(self._near(pairs.ids, pairs.count, is_edge, here, there, stiffness, problem))
         near = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *kinds)
+        # Every iteration goes through the whole table: those that have no energy leave it.
+        in_use, num_used = true_rows(near.stiffness > 0, rows)
+        near = jax.tree.map(lambda leaf: jnp.take(leaf, in_use, axis=-1, mode="fill", fill_value=0), near)
         nowhere = jnp.zeros_like(problem.position)
         none = still_contacts(nowhere, nowhere, nowhere[:, 0], jnp.zeros(count, bool))
         held = BodyContact(none, None, self.thickness, stiffness)
-        return Meetings(start, near, held, found.most, _friction(problem).slip(problem))
+        most_near = jnp.maximum(num_used, -(-found.most // _LOOKED_AT))
+        return Meetings(start, near, held, most_near, _friction(problem).slip(problem))
 
     def _near(
         self,
@@ -290,8 +299,6 @@ class Contact(Term):
         # Where a pair is nearest on the rim, the normal leans, and would stand in the way of what slides: its
         # neighbours hold it.
         is_counted = jnp.min(jnp.abs(weights), axis=0) > _RIM
-        if not is_edge:  # a vertex over the body is `Collision`'s, which knows what is near at t
-            is_counted = is_counted & ~(is_cloth[0] & ~is_cloth[1])
         is_counted = is_counted & (jnp.arange(ids.shape[1]) < count)
         near_pairs = NearPairs(
             vertices=vertices,
