@@ -8,8 +8,8 @@ its length is their exact distance, and its direction separates the two, since b
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -211,25 +211,51 @@ def pushed_apart(
     movable = is_free.astype(start[0].dtype)
 
     def sweep(carry):
-        end, _, number = carry
-        moves, worst = jnp.zeros((start[0].shape[0], 4), start[0].dtype), jnp.zeros((), start[0].dtype)
-        for kind, is_edge in pairs.kinds:
+        end, lacks, is_moved, number = carry
+        moves, now = jnp.zeros((len(movable), 4), movable.dtype), []
+        for (kind, is_edge), before in zip(pairs.kinds, lacks, strict=True):
 
-            def add(carry, ids: Array, is_used: Array, is_edge: bool = is_edge):
-                moves, worst = carry
+            def look(chunk: Array, ids: Array, carry, count: Array = kind.count, is_edge: bool = is_edge):
+                moves, lacks = carry
+                is_used = chunk * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32) < count
                 lack, pushes = _pushes(start, end, movable, ids, is_used, is_edge)
                 # Joined, though XLA computes what it joins in a loop that it can't vectorise: there are few rows.
-                return moves.at[ids.ravel()].add(pushes), jnp.maximum(worst, lack)
+                return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack)
 
-            moves, worst = over_rows(kind, (moves, worst), add)
+            def look_where_moved(carry, look=look, table: Array = kind.ids):
+                chunk, (moves, lacks) = carry
+                ids = jax.lax.dynamic_slice_in_dim(table, chunk * CHUNK, CHUNK, axis=1)
+                # Rows that lacked nothing lack nothing while nothing of them moves.
+                is_open = (lacks[chunk] > 0) | jnp.any(is_moved[ids])
+                found = jax.lax.cond(is_open, look, lambda _, __, same: same, chunk, ids, (moves, lacks))
+                return chunk + 1, found
+
+            chunks = (kind.count + CHUNK - 1) // CHUNK
+            _, (moves, lack) = jax.lax.while_loop(
+                lambda carry, chunks=chunks: carry[0] < chunks,
+                look_where_moved,
+                (jnp.int32(0), (moves, before)),
+            )
+            now.append(lack)
         count = jnp.maximum(moves[:, 3], 1.0)
         pushed = tuple(part + moves[:, axis] / count for axis, part in enumerate(end))
-        return pushed, worst, number + 1
+        return pushed, tuple(now), moves[:, 3] > 0, number + 1
 
-    # The lack is of before the last push: one more sweep sees whether nothing is left.
-    first = (end, jnp.full((), jnp.inf, start[0].dtype), jnp.int32(0))
-    end, worst, _ = jax.lax.while_loop(lambda carry: (carry[1] > 0) & (carry[2] < sweeps), sweep, first)
-    return end, worst
+    def worst(lacks) -> Float[Array, ""]:
+        return jnp.maximum(*(jnp.max(lack) for lack in lacks))
+
+    # What every chunk of rows lacks, before the last push: one more sweep sees whether nothing is left.
+    lacks = tuple(
+        jnp.where(
+            jnp.arange(0, kind.ids.shape[1], CHUNK) < kind.count, jnp.asarray(jnp.inf, movable.dtype), 0.0
+        )
+        for kind, _ in pairs.kinds
+    )
+    first = (end, lacks, jnp.ones(len(movable), bool), jnp.int32(0))
+    end, lacks, _, _ = jax.lax.while_loop(
+        lambda carry: (worst(carry[1]) > 0) & (carry[3] < sweeps), sweep, first
+    )
+    return end, worst(lacks)
 
 
 def _pushes(
@@ -263,20 +289,3 @@ def _pushes(
     # A pair that is apart at the end, but not for certain on the way, lacks something too.
     lack = jnp.where(is_lacking, jnp.maximum(GAP - (lowest - highest), _SHORT), 0.0)
     return jnp.max(lack), jnp.concatenate(entries)
-
-
-_Carry = TypeVar("_Carry")
-
-
-def over_rows(
-    rows: Rows, start: _Carry, add: Callable[[_Carry, Int[Array, "4 chunk"], Bool[Array, " chunk"]], _Carry]
-) -> _Carry:
-    """Return a start to which the rows in use are added, `CHUNK` at a time, with a mask of those in use."""
-
-    def chunk(carry):
-        first, value = carry
-        ids = jax.lax.dynamic_slice_in_dim(rows.ids, first, CHUNK, axis=1)
-        is_used = first + jnp.arange(CHUNK, dtype=jnp.int32) < rows.count
-        return first + CHUNK, add(value, ids, is_used)
-
-    return jax.lax.while_loop(lambda carry: carry[0] < rows.count, chunk, (jnp.int32(0), start))[1]
