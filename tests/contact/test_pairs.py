@@ -100,6 +100,25 @@ def test_gaps_do_not_shrink_below_the_floor(is_edge):
     assert float(distance.min()) >= pairs.FLOOR
 
 
+def test_what_is_pushed_onto_others_is_pushed_off_them():
+    """An edge falls on one that lies on a third. Sweeps leave out chunks of rows in which nothing moves."""
+    x = np.float32([[0, 1, -10], [0, 1, 10], [-10, 0, 0], [10, 0, 0], [0, -0.6, -10], [0, -0.6, 10]]) * 1e-3
+    step = np.zeros_like(x)
+    step[:2, 1] = -3e-3
+    # A chunk for each pair.
+    ids = np.zeros((4, 2 * pairs.CHUNK), np.int32)
+    ids[:, : pairs.CHUNK] = np.arange(4)[:, None]
+    ids[:, pairs.CHUNK] = np.arange(2, 6)
+    edges = pairs.Rows(jnp.asarray(ids), jnp.int32(pairs.CHUNK + 1))
+    is_free = jnp.asarray(np.arange(6) < 4)
+    ends, lack = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), is_free, 60)
+    assert float(lack) == 0
+    heights = np.asarray(ends[1]).reshape(3, 2)
+    assert heights[0].min() > heights[1].max() + pairs.FLOOR
+    assert heights[1].min() > heights[2].max() + pairs.FLOOR
+    assert heights[1].max() < 0  # the fallen edge moved it
+
+
 def test_edges_that_slide_past_each_other_are_not_pushed():
     """By 34 mm a frame, 2 mm apart: a fast sheet on a slope caught on every edge of the ground."""
     x = np.float32([[-0.017, 0.002, -0.02], [-0.017, 0.002, 0.02], [0, 0, -0.1], [0, 0, 0.1]])
