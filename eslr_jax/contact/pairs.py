@@ -193,10 +193,18 @@ def _where(condition: Array, one: Vector3, other: Vector3) -> Vector3:
     return tuple(jnp.where(condition, a, b) for a, b in zip(one, other, strict=True))  # type: ignore[return-value]
 
 
+class Pushed(NamedTuple):
+    """Ends of straight ways, pushed so that no pair meets."""
+
+    end: Vector3  # [m]
+    lack: Float[Array, ""]  # gap that is left to be made [m]
+    is_held: Bool[Array, ""]  # a pair meets, and none of its vertices may be pushed
+
+
 def pushed_apart(
     start: Vector3, end: Vector3, pairs: Pairs, is_free: Bool[Array, " vertices"], sweeps: int
-) -> tuple[Vector3, Float[Array, ""]]:
-    """Return ends of straight ways, pushed so that no pair meets, and what gap is lacking.
+) -> Pushed:
+    """Return ends of straight ways, pushed so that no pair meets.
 
     A pair that may meet, or ends nearer than `FLOOR`, is pushed apart to half a millimetre, along the direction
     that separated it last. Vertices take the mean of their pushes.
@@ -211,35 +219,35 @@ def pushed_apart(
     movable = is_free.astype(start[0].dtype)
 
     def sweep(carry):
-        end, lacks, is_moved, number = carry
+        end, lacks, is_held, is_moved, number = carry
         moves, now = jnp.zeros((len(movable), 4), movable.dtype), []
         for (kind, is_edge), before in zip(pairs.kinds, lacks, strict=True):
 
             def look(chunk: Array, ids: Array, carry, count: Array = kind.count, is_edge: bool = is_edge):
-                moves, lacks = carry
+                moves, lacks, is_held = carry
                 is_used = chunk * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32) < count
-                lack, pushes = _pushes(start, end, movable, ids, is_used, is_edge)
+                lack, stays, pushes = _pushes(start, end, movable, ids, is_used, is_edge)
                 # Joined, though XLA computes what it joins in a loop that it can't vectorise: there are few rows.
-                return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack)
+                return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack), is_held | stays
 
             def look_where_moved(carry, look=look, table: Array = kind.ids):
-                chunk, (moves, lacks) = carry
+                chunk, (moves, lacks, is_held) = carry
                 ids = jax.lax.dynamic_slice_in_dim(table, chunk * CHUNK, CHUNK, axis=1)
                 # Rows that lacked nothing lack nothing while nothing of them moves.
                 is_open = (lacks[chunk] > 0) | jnp.any(is_moved[ids])
-                found = jax.lax.cond(is_open, look, lambda _, __, same: same, chunk, ids, (moves, lacks))
-                return chunk + 1, found
+                found = (moves, lacks, is_held)
+                return chunk + 1, jax.lax.cond(is_open, look, lambda _, __, same: same, chunk, ids, found)
 
             chunks = (kind.count + CHUNK - 1) // CHUNK
-            _, (moves, lack) = jax.lax.while_loop(
+            _, (moves, lack, is_held) = jax.lax.while_loop(
                 lambda carry, chunks=chunks: carry[0] < chunks,
                 look_where_moved,
-                (jnp.int32(0), (moves, before)),
+                (jnp.int32(0), (moves, before, is_held)),
             )
             now.append(lack)
         count = jnp.maximum(moves[:, 3], 1.0)
         pushed = tuple(part + moves[:, axis] / count for axis, part in enumerate(end))
-        return pushed, tuple(now), moves[:, 3] > 0, number + 1
+        return pushed, tuple(now), is_held, moves[:, 3] > 0, number + 1
 
     def worst(lacks) -> Float[Array, ""]:
         return jnp.maximum(*(jnp.max(lack) for lack in lacks))
@@ -251,11 +259,11 @@ def pushed_apart(
         )
         for kind, _ in pairs.kinds
     )
-    first = (end, lacks, jnp.ones(len(movable), bool), jnp.int32(0))
-    end, lacks, _, _ = jax.lax.while_loop(
-        lambda carry: (worst(carry[1]) > 0) & (carry[3] < sweeps), sweep, first
+    first = (end, lacks, jnp.zeros((), bool), jnp.ones(len(movable), bool), jnp.int32(0))
+    end, lacks, is_held, _, _ = jax.lax.while_loop(
+        lambda carry: (worst(carry[1]) > 0) & (carry[4] < sweeps), sweep, first
     )
-    return end, worst(lacks)
+    return Pushed(end, worst(lacks), is_held)
 
 
 def _pushes(
@@ -265,8 +273,11 @@ def _pushes(
     ids: Int[Array, "corners rows"],
     is_used: Bool[Array, " rows"],
     is_edge: bool,
-) -> tuple[Float[Array, ""], Float[Array, "entries 4"]]:
-    """Return by how much pairs lack their gap at the end [m], and moves that mend it, with a count."""
+) -> tuple[Float[Array, ""], Bool[Array, ""], Float[Array, "entries 4"]]:
+    """Return by how much pairs lack their gap at the end [m], and moves that mend it, with a count.
+
+    Between them stands whether there are pairs that meet and of which nothing may be moved.
+    """
     p, side = corners_of(end, ids), signs(is_edge)
     course = _followed(corners_of(start, ids), p, is_edge)
     free = [movable[row] for row in ids]
@@ -276,7 +287,8 @@ def _pushes(
     )
     along = _heights(course.last, p)
     lowest, highest = _between(along, side)
-    is_lacking = is_used & (can_first | can_second) & ~course.is_parted
+    meets, can_move = is_used & ~course.is_parted, can_first | can_second
+    is_lacking = meets & can_move
     middle = 0.5 * (lowest + highest)
     upper = jnp.where(can_first & can_second, middle + 0.5 * _PUSHED, highest + _PUSHED)
     lower = jnp.where(can_first & can_second, middle - 0.5 * _PUSHED, lowest - _PUSHED)
@@ -288,4 +300,4 @@ def _pushes(
         entries.append(jnp.stack([*(part * up for part in course.last), is_pushed], axis=1))
     # A pair that is apart at the end, but not for certain on the way, lacks something too.
     lack = jnp.where(is_lacking, jnp.maximum(GAP - (lowest - highest), _SHORT), 0.0)
-    return jnp.max(lack), jnp.concatenate(entries)
+    return jnp.max(lack), jnp.any(meets & ~can_move), jnp.concatenate(entries)

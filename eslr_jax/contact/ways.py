@@ -73,11 +73,11 @@ def move_clear(
         half = 0.5 * (end - start)
         motion = Motion(_rows(start + half), _rows(half - 0.5 * part.length * drift), radius)
         found = find_pairs(motion, meshes, rows)
-        pushed, lack = pushed_apart(_rows(start), _rows(end), found.pairs, can_move, _SWEEPS)
-        reached = jnp.stack(pushed)[:, :count]
+        pushed = pushed_apart(_rows(start), _rows(end), found.pairs, can_move, _SWEEPS)
+        reached = jnp.stack(pushed.end)[:, :count]
         farthest = jnp.max(safe_norm(reached - part.end, axis=0))
         is_full = found.most > rows
-        is_clear = (lack == 0) & (farthest <= _MARGIN) & ~is_full
+        is_clear = (pushed.lack == 0) & (farthest <= _MARGIN) & ~is_full
         is_tried = part.tries + 1 >= _TRIES
         # With too small a table the frame is done anew.
         is_done = is_clear | is_full | (is_tried & (part.length <= _LEAST_PART))
@@ -93,7 +93,7 @@ def move_clear(
             share=share,
             length=length,
             tries=jnp.where(is_new, 0, part.tries + 1),
-            is_passed=part.is_passed | (is_done & ~is_clear),
+            is_passed=part.is_passed | (is_done & (~is_clear | pushed.is_held)),
             most=jnp.maximum(part.most, found.most),
         )
 
