@@ -170,7 +170,8 @@ class Contact(Term):
     starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed
     far, the cloth around has to follow: what was pushed is held by planes with the same barrier, and the frame is
     solved again. The body yields where its own parts pass through each other (`mesh.parting`). Where that
-    makes no room, something is let through, and the trajectory says in which frame.
+    makes no room, or where pinned cloth would have to be pushed, something is let through, and the trajectory says in
+    which frame.
 
     A derivative takes no notice of the pushes.
 

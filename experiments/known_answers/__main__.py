@@ -128,7 +128,7 @@ def main() -> None:
             told = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
             print(part, told, flush=True)
     draw(result, drapes, path.with_suffix(".png"))
-    missed = [row for part in arguments.part for row in result[part] if row.get("is_within") is False]
+    missed = [row for part in arguments.part for row in result.get(part, []) if row.get("is_within") is False]
     if arguments.smoke and missed:
         sys.exit("outside their bar: " + "; ".join(f"{row['case']}, {row['setting']}" for row in missed))
 
