@@ -15,6 +15,8 @@ from eslr_jax.contact.search import Candidates, append, test_candidates
 from eslr_jax.numerics import TrueEntries, Vector3, entries_where, in_memory
 from eslr_jax.types import BodySurface, Garment
 
+_NUMBERS = 9  # of a box
+
 
 @struct.dataclass
 class Primitives:
@@ -190,9 +192,6 @@ def _ranges(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array,
     # All in one: XLA computes maxima anew for every couple of groups where each has its own array, in 60 times
     # the time.
     return jnp.max(jnp.stack(ends)[:, blocks], axis=2)
-
-
-_NUMBERS = 9  # of a box
 
 
 def _table(primitives: Primitives, boxes: _Boxes) -> Float[Array, "blocks numbers members"]:

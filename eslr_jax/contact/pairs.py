@@ -8,7 +8,7 @@ its length is their exact distance, and its direction separates the two, since b
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -221,29 +221,9 @@ def pushed_apart(
     def sweep(carry):
         end, lacks, is_held, is_moved, number = carry
         moves, now = jnp.zeros((len(movable), 4), movable.dtype), []
-        for (kind, is_edge), before in zip(pairs.kinds, lacks, strict=True):
-
-            def look(chunk: Array, ids: Array, carry, count: Array = kind.count, is_edge: bool = is_edge):
-                moves, lacks, is_held = carry
-                is_used = chunk * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32) < count
-                lack, stays, pushes = _pushes(start, end, movable, ids, is_used, is_edge)
-                # Joined, though XLA computes what it joins in a loop that it can't vectorise: there are few rows.
-                return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack), is_held | stays
-
-            def look_where_moved(carry, look=look, table: Array = kind.ids):
-                chunk, (moves, lacks, is_held) = carry
-                ids = jax.lax.dynamic_slice_in_dim(table, chunk * CHUNK, CHUNK, axis=1)
-                # Rows that lacked nothing lack nothing while nothing of them moves.
-                is_open = (lacks[chunk] > 0) | jnp.any(is_moved[ids])
-                found = (moves, lacks, is_held)
-                return chunk + 1, jax.lax.cond(is_open, look, lambda _, __, same: same, chunk, ids, found)
-
-            chunks = (kind.count + CHUNK - 1) // CHUNK
-            _, (moves, lack, is_held) = jax.lax.while_loop(
-                lambda carry, chunks=chunks: carry[0] < chunks,
-                look_where_moved,
-                (jnp.int32(0), (moves, before, is_held)),
-            )
+        for (rows, is_edge), lack in zip(pairs.kinds, lacks, strict=True):
+            pushes_of = functools.partial(_pushes, start, end, movable, is_edge=is_edge)
+            moves, lack, is_held = _looked_through(rows, is_moved, pushes_of, (moves, lack, is_held))
             now.append(lack)
         count = jnp.maximum(moves[:, 3], 1.0)
         pushed = tuple(part + moves[:, axis] / count for axis, part in enumerate(end))
@@ -264,6 +244,35 @@ def pushed_apart(
         lambda carry: (worst(carry[1]) > 0) & (carry[4] < sweeps), sweep, first
     )
     return Pushed(end, worst(lacks), is_held)
+
+
+_Found = tuple[Float[Array, "vertices 4"], Float[Array, " chunks"], Bool[Array, ""]]
+"""Moves with their counts, what every chunk of rows lacks [m], and whether a pair is held."""
+
+
+def _looked_through(
+    rows: Rows, is_moved: Bool[Array, " vertices"], pushes_of: Callable, found: _Found
+) -> _Found:
+    """Return what was found with the pushes of pairs added, `CHUNK` at a time.
+
+    Chunks that lacked nothing are left out where nothing has moved: they lack nothing.
+    """
+
+    def look(chunk: Array, ids: Array, found: _Found) -> _Found:
+        moves, lacks, is_held = found
+        is_used = chunk * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32) < rows.count
+        lack, stays, pushes = pushes_of(ids, is_used)
+        # Joined, though XLA computes what it joins in a loop that it can't vectorise: there are few rows.
+        return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack), is_held | stays
+
+    def step(carry):
+        chunk, found = carry
+        ids = jax.lax.dynamic_slice_in_dim(rows.ids, chunk * CHUNK, CHUNK, axis=1)
+        is_open = (found[1][chunk] > 0) | jnp.any(is_moved[ids])
+        return chunk + 1, jax.lax.cond(is_open, look, lambda _, __, same: same, chunk, ids, found)
+
+    chunks = (rows.count + CHUNK - 1) // CHUNK
+    return jax.lax.while_loop(lambda carry: carry[0] < chunks, step, (jnp.int32(0), found))[1]
 
 
 def _pushes(
