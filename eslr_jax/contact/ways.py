@@ -22,7 +22,8 @@ class Moved(NamedTuple):
     """Where cloth has got to."""
 
     position: Float[Array, "3 vertices"]  # [m]
-    is_passed: Bool[Array, ""]  # something may have passed through the cloth
+    is_passed: Bool[Array, ""]  # something may have passed through the cloth, as pushes did not end
+    is_held: Bool[Array, ""]  # something has passed that must not be pushed
     most: Int[Array, ""]  # rows that the fullest search would have needed
 
 
@@ -35,6 +36,7 @@ class _Part(NamedTuple):
     length: Float[Array, ""]  # share of the part
     tries: Int[Array, ""]
     is_passed: Bool[Array, ""]
+    is_held: Bool[Array, ""]
     most: Int[Array, ""]
 
 
@@ -93,14 +95,15 @@ def move_clear(
             share=share,
             length=length,
             tries=jnp.where(is_new, 0, part.tries + 1),
-            is_passed=part.is_passed | (is_done & (~is_clear | pushed.is_held)),
+            is_passed=part.is_passed | (is_done & ~is_clear),
+            is_held=part.is_held | (is_done & pushed.is_held),
             most=jnp.maximum(part.most, found.most),
         )
 
     one, no = jnp.ones((), x.dtype), jnp.zeros((), bool)
-    whole = _Part(x, x + way, 0.0 * one, one, jnp.int32(0), no, jnp.int32(0))
+    whole = _Part(x, x + way, 0.0 * one, one, jnp.int32(0), no, no, jnp.int32(0))
     final = jax.lax.while_loop(lambda part: part.share < 1.0, attempt, whole)
-    return Moved(final.x, final.is_passed, final.most)
+    return Moved(final.x, final.is_passed, final.is_held, final.most)
 
 
 def _rows(values: Float[Array, "3 vertices"]) -> Vector3:

@@ -24,7 +24,7 @@ from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 # A limb that moves by 16 cm in a frame takes the cloth in its way along: trousers on a kick to 2 to 9 times their
-# length. In four steps the cloth slides off the limb, and keeps within 1.5 to 2.3 times.
+# length. In four steps the cloth slides off the limb, and keeps within 1.5 to 2.0 times.
 _TORN = 1.6  # times its rest length, of an edge; of cloth that hangs or is worn, 1.1 to 1.45
 _PARTS = 4
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it

@@ -47,8 +47,9 @@ from eslr_jax.types import BodyMotion, BodySurface, Garment, Obstacle, Scene
 _GROWTH = 16e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
 _ROWS = 8  # per vertex of the cloth, of the tables that a scene begins with; a T-shirt needs one, a dress two
 _HEADROOM = 1.5  # of larger tables
-# Pairs that have an energy have a table of one row in so many, or of the least number: a T-shirt needs one in 50
-# to 40, a dress one in 50. The tables in which they are looked for have so many times its rows, for the rest.
+# Pairs that have an energy have a table of one row in so many, or of the least number: a T-shirt needs one in 60
+# at 1k and one in 37 at 4k and 10k, a dress at 4k one in 41. The tables in which they are looked for have so many
+# times its rows, for the rest.
 _NEAR_SHARE, _LEAST_NEAR = 32, 256
 _LOOKED_AT = 4
 # [m] from which pairs are near. It is more than the thickness, so that those that repel each other in one frame
@@ -152,7 +153,8 @@ class Meetings(NamedTuple):
     held: BodyContact  # with planes across the pushes of vertices, which keep them where they were pushed to
     most_near: Int[Array, ""]  # rows that their table would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
-    is_passed: Bool[Array, ""] | bool = False
+    is_passed: Bool[Array, ""] | bool = False  # as pushes did not end
+    is_held: Bool[Array, ""] | bool = False  # something passed that must not be pushed
     most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
     is_far: Bool[Array, ""] | bool = False  # an end was pushed by `_FAR`
 
@@ -170,8 +172,8 @@ class Contact(Term):
     starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed
     far, the cloth around has to follow: what was pushed is held by planes with the same barrier, and the frame is
     solved again. The body yields where its own parts pass through each other (`mesh.parting`). Where that
-    makes no room, or where pinned cloth would have to be pushed, something is let through, and the trajectory says in
-    which frame.
+    makes no room, or where pinned cloth would have to be pushed, something is let through, and the trajectory
+    says in which frame.
 
     A derivative takes no notice of the pushes.
 
@@ -360,7 +362,9 @@ class Contact(Term):
             is_held | last.is_near,
         )
         held = data.held._replace(nearest=jax.lax.stop_gradient(nearest))
-        found = data._replace(held=held, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
+        found = data._replace(
+            held=held, is_passed=ended.is_passed, is_held=ended.is_held, most=ended.most, is_far=is_far
+        )
         return position + pushed, found
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Meetings) -> tuple[Elements, ...]:
@@ -395,7 +399,11 @@ class Contact(Term):
 
     def is_passed(self, data: Meetings) -> Bool[Array, ""] | None:
         """Return whether something was let through."""
-        return jnp.asarray(data.is_passed)
+        return jnp.asarray(data.is_passed | data.is_held)
+
+    def is_unreached(self, data: Meetings) -> Bool[Array, ""] | bool:
+        """Return whether pushes did not end."""
+        return data.is_passed
 
     def is_far(self, data: Meetings) -> Bool[Array, ""] | bool:
         """Return whether an end was pushed so far that cloth around it has to follow."""
