@@ -198,11 +198,10 @@ class Pushed(NamedTuple):
 
     end: Vector3  # [m]
     lack: Float[Array, ""]  # gap that is left to be made [m]
-    is_held: Bool[Array, ""]  # a pair meets, and none of its vertices may be pushed
 
 
 def pushed_apart(
-    start: Vector3, end: Vector3, pairs: Pairs, is_free: Bool[Array, " vertices"], sweeps: int
+    start: Vector3, end: Vector3, pairs: Pairs, freedom: Int[Array, " vertices"], sweeps: int
 ) -> Pushed:
     """Return ends of straight ways, pushed so that no pair meets.
 
@@ -213,21 +212,21 @@ def pushed_apart(
         start: Vertices before, by components [m]; no pair crosses.
         end: Vertices after.
         pairs: All that may meet.
-        is_free: Vertices that may be pushed.
+        freedom: Of every pair those vertices are pushed that have the most; none is that has zero.
         sweeps: Bound of the number of sweeps.
     """
-    movable = is_free.astype(start[0].dtype)
+    count, dtype = len(freedom), start[0].dtype
 
     def sweep(carry):
-        end, lacks, is_held, is_moved, number = carry
-        moves, now = jnp.zeros((len(movable), 4), movable.dtype), []
+        end, lacks, is_moved, number = carry
+        moves, now = jnp.zeros((count, 4), dtype), []
         for (rows, is_edge), lack in zip(pairs.kinds, lacks, strict=True):
-            pushes_of = functools.partial(_pushes, start, end, movable, is_edge=is_edge)
-            moves, lack, is_held = _looked_through(rows, is_moved, pushes_of, (moves, lack, is_held))
+            pushes_of = functools.partial(_pushes, start, end, freedom, is_edge=is_edge)
+            moves, lack = _looked_through(rows, is_moved, pushes_of, (moves, lack))
             now.append(lack)
-        count = jnp.maximum(moves[:, 3], 1.0)
-        pushed = tuple(part + moves[:, axis] / count for axis, part in enumerate(end))
-        return pushed, tuple(now), is_held, moves[:, 3] > 0, number + 1
+        times = jnp.maximum(moves[:, 3], 1.0)
+        pushed = tuple(part + moves[:, axis] / times for axis, part in enumerate(end))
+        return pushed, tuple(now), moves[:, 3] > 0, number + 1
 
     def worst(lacks) -> Float[Array, ""]:
         return jnp.maximum(*(jnp.max(lack) for lack in lacks))
@@ -235,19 +234,19 @@ def pushed_apart(
     # What every chunk of rows lacks, before the last push: one more sweep sees whether nothing is left.
     lacks = tuple(
         jnp.where(
-            jnp.arange(0, kind.ids.shape[1], CHUNK) < kind.count, jnp.asarray(jnp.inf, movable.dtype), 0.0
+            jnp.arange(0, kind.ids.shape[1], CHUNK) < kind.count, jnp.asarray(jnp.inf, dtype), 0.0
         )
         for kind, _ in pairs.kinds
     )
-    first = (end, lacks, jnp.zeros((), bool), jnp.ones(len(movable), bool), jnp.int32(0))
-    end, lacks, is_held, _, _ = jax.lax.while_loop(
-        lambda carry: (worst(carry[1]) > 0) & (carry[4] < sweeps), sweep, first
+    first = (end, lacks, jnp.ones(count, bool), jnp.int32(0))
+    end, lacks, _, _ = jax.lax.while_loop(
+        lambda carry: (worst(carry[1]) > 0) & (carry[3] < sweeps), sweep, first
     )
-    return Pushed(end, worst(lacks), is_held)
+    return Pushed(end, worst(lacks))
 
 
-_Found = tuple[Float[Array, "vertices 4"], Float[Array, " chunks"], Bool[Array, ""]]
-"""Moves with their counts, what every chunk of rows lacks [m], and whether a pair is held."""
+_Found = tuple[Float[Array, "vertices 4"], Float[Array, " chunks"]]
+"""Moves with their counts, and what every chunk of rows lacks [m]."""
 
 
 def _looked_through(
@@ -259,11 +258,11 @@ def _looked_through(
     """
 
     def look(chunk: Array, ids: Array, found: _Found) -> _Found:
-        moves, lacks, is_held = found
+        moves, lacks = found
         is_used = chunk * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32) < rows.count
-        lack, stays, pushes = pushes_of(ids, is_used)
+        lack, pushes = pushes_of(ids, is_used)
         # Joined, though XLA computes what it joins in a loop that it can't vectorise: there are few rows.
-        return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack), is_held | stays
+        return moves.at[ids.ravel()].add(pushes), lacks.at[chunk].set(lack)
 
     def step(carry):
         chunk, found = carry
@@ -278,35 +277,32 @@ def _looked_through(
 def _pushes(
     start: Vector3,
     end: Vector3,
-    movable: Float[Array, " vertices"],
+    freedom: Int[Array, " vertices"],
     ids: Int[Array, "corners rows"],
     is_used: Bool[Array, " rows"],
     is_edge: bool,
-) -> tuple[Float[Array, ""], Bool[Array, ""], Float[Array, "entries 4"]]:
-    """Return by how much pairs lack their gap at the end [m], and moves that mend it, with a count.
-
-    Between them stands whether there are pairs that meet and of which nothing may be moved.
-    """
+) -> tuple[Float[Array, ""], Float[Array, "entries 4"]]:
+    """Return by how much pairs lack their gap at the end [m], and moves that mend it, with a count."""
     p, side = corners_of(end, ids), signs(is_edge)
     course = _followed(corners_of(start, ids), p, is_edge)
-    free = [movable[row] for row in ids]
+    free = freedom[ids]
+    is_movable = (free > 0) & (free == jnp.max(free, axis=0, keepdims=True))
     can_second, can_first = (
-        functools.reduce(jnp.maximum, [f for f, s in zip(free, side, strict=True) if s == one]) > 0
+        functools.reduce(jnp.logical_or, [m for m, s in zip(is_movable, side, strict=True) if s == one])
         for one in (-1, 1)
     )
     along = _heights(course.last, p)
     lowest, highest = _between(along, side)
-    meets, can_move = is_used & ~course.is_parted, can_first | can_second
-    is_lacking = meets & can_move
+    is_lacking = is_used & ~course.is_parted & (can_first | can_second)
     middle = 0.5 * (lowest + highest)
     upper = jnp.where(can_first & can_second, middle + 0.5 * _PUSHED, highest + _PUSHED)
     lower = jnp.where(can_first & can_second, middle - 0.5 * _PUSHED, lowest - _PUSHED)
     entries = []
     for k in range(4):
         up = jnp.maximum(upper - along[k], 0.0) if side[k] > 0 else jnp.minimum(lower - along[k], 0.0)
-        up = jnp.where(is_lacking & (free[k] > 0), _OVERSHOOT * up, 0.0)
+        up = jnp.where(is_lacking & is_movable[k], _OVERSHOOT * up, 0.0)
         is_pushed = (up != 0).astype(up.dtype)
         entries.append(jnp.stack([*(part * up for part in course.last), is_pushed], axis=1))
     # A pair that is apart at the end, but not for certain on the way, lacks something too.
     lack = jnp.where(is_lacking, jnp.maximum(GAP - (lowest - highest), _SHORT), 0.0)
-    return jnp.max(lack), jnp.any(meets & ~can_move), jnp.concatenate(entries)
+    return jnp.max(lack), jnp.concatenate(entries)

@@ -23,7 +23,6 @@ class Moved(NamedTuple):
 
     position: Float[Array, "3 vertices"]  # [m]
     is_passed: Bool[Array, ""]  # something may have passed through the cloth, as pushes did not end
-    is_held: Bool[Array, ""]  # something has passed that must not be pushed
     most: Int[Array, ""]  # rows that the fullest search would have needed
 
 
@@ -36,7 +35,6 @@ class _Part(NamedTuple):
     length: Float[Array, ""]  # share of the part
     tries: Int[Array, ""]
     is_passed: Bool[Array, ""]
-    is_held: Bool[Array, ""]
     most: Int[Array, ""]
 
 
@@ -46,7 +44,7 @@ def move_clear(
     body: Float[Array, "3 surface_vertices"],
     body_way: Float[Array, "3 surface_vertices"],
     meshes: Meshes,
-    is_free: Bool[Array, " vertices"],
+    freedom: Int[Array, " vertices"],
     rows: int,
 ) -> Moved:
     """Move cloth along its way, off which it is pushed where it would cross the body or itself.
@@ -59,14 +57,14 @@ def move_clear(
         body: Vertices of the body [m].
         body_way: That the body goes [m].
         meshes: Of both.
-        is_free: Vertices that may be pushed.
+        freedom: Of the cloth's vertices, as `pairs.pushed_apart` takes it; the body has none.
         rows: Size of the tables of pairs; static.
     """
     count = x.shape[1]
     ways = jnp.concatenate([way, body_way], axis=1)
     drift = jnp.mean(ways, axis=1, keepdims=True)  # that all share: boxes are smaller without it
-    can_move = jnp.pad(is_free, (0, body.shape[1]))
-    radius = jnp.where(can_move, jnp.asarray(_MARGIN, x.dtype), 0.0)
+    freedom = jnp.pad(freedom, (0, body.shape[1]))
+    radius = jnp.where(freedom > 0, jnp.asarray(_MARGIN, x.dtype), 0.0)
 
     def attempt(part: _Part) -> _Part:
         share = part.share + part.length
@@ -75,7 +73,7 @@ def move_clear(
         half = 0.5 * (end - start)
         motion = Motion(_rows(start + half), _rows(half - 0.5 * part.length * drift), radius)
         found = find_pairs(motion, meshes, rows)
-        pushed = pushed_apart(_rows(start), _rows(end), found.pairs, can_move, _SWEEPS)
+        pushed = pushed_apart(_rows(start), _rows(end), found.pairs, freedom, _SWEEPS)
         reached = jnp.stack(pushed.end)[:, :count]
         farthest = jnp.max(safe_norm(reached - part.end, axis=0))
         is_full = found.most > rows
@@ -96,14 +94,13 @@ def move_clear(
             length=length,
             tries=jnp.where(is_new, 0, part.tries + 1),
             is_passed=part.is_passed | (is_done & ~is_clear),
-            is_held=part.is_held | (is_done & pushed.is_held),
             most=jnp.maximum(part.most, found.most),
         )
 
     one, no = jnp.ones((), x.dtype), jnp.zeros((), bool)
-    whole = _Part(x, x + way, 0.0 * one, one, jnp.int32(0), no, no, jnp.int32(0))
+    whole = _Part(x, x + way, 0.0 * one, one, jnp.int32(0), no, jnp.int32(0))
     final = jax.lax.while_loop(lambda part: part.share < 1.0, attempt, whole)
-    return Moved(final.x, final.is_passed, final.is_held, final.most)
+    return Moved(final.x, final.is_passed, final.most)
 
 
 def _rows(values: Float[Array, "3 vertices"]) -> Vector3:

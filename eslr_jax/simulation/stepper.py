@@ -100,7 +100,9 @@ def make_stepper(
             unknown = jnp.full_like(point.value, jnp.inf)
             position, data = corrected(point.position, problem)
             minimum = Minimum(position, *point[1:], iterations=jnp.int32(0), gap_bound=unknown)
-        position, ended = pin(problem, minimum.position), problem.replace(data=data)
+        # Pins may have yielded, and have a derivative all the same.
+        pinned, ended = pin(problem, minimum.position), problem.replace(data=data)
+        position = pinned + jax.lax.stop_gradient(minimum.position - pinned)
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
             energies=potential_terms(position, problem),

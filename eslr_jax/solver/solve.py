@@ -25,7 +25,7 @@ from eslr_jax.numerics import safe_norm
 from eslr_jax.solver import tangent
 from eslr_jax.solver.guess import Start
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
-from eslr_jax.solver.potential import Point, corrected, potential
+from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
 from eslr_jax.solver.tangent import LinearSolution, solve_symmetric
 from eslr_jax.terms.problem import FrameProblem, weight_norm
@@ -125,10 +125,6 @@ def _solve(
     if not is_corrected:
         return Solved(_minimum(problem, start, stop, memory), problem.data)
 
-    def is_unreached(data: tuple[Any, ...]) -> Array | bool:
-        found = (term.is_unreached(own) for term, own in zip(problem.terms, data, strict=True))
-        return functools.reduce(jnp.logical_or, found, False)
-
     def is_going(carry: tuple[Solved, Array]) -> Array:
         (_, data), count = carry
         far = (term.is_far(own) for term, own in zip(problem.terms, data, strict=True))
@@ -148,8 +144,9 @@ def _solve(
         solved = Solved(minimum._replace(position=position, iterations=spent), data)
         # What can't be reached without letting something through is no end for a frame that has another one, and
         # once more does not help it.
-        is_lost = (count > 0) & is_unreached(data)
-        is_worse = is_lost & jnp.logical_not(is_unreached(last.data))
+        before, after = (any_passed(now.replace(data=one)) for one in (last.data, data))
+        is_lost = False if after is None else (count > 0) & after
+        is_worse = False if before is None else is_lost & ~before
         kept = jax.tree.map(lambda old, new: jnp.where(is_worse, old, new), last, solved)
         return kept, jnp.where(is_lost, _PASSES, count + 1)
 

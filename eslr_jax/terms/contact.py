@@ -79,6 +79,11 @@ def _under_skin(
     return body - _GROWTH * vertex_normals(body, surface.faces, surface.face_incidence)
 
 
+def _freedom(garment: Garment, is_free: Bool[Array, " vertices"]) -> Int[Array, " vertices"]:
+    """Return 2 for vertices that are free, and 1 for what is pinned: it yields where nothing else can."""
+    return garment.vertex_mask.astype(jnp.int32) + is_free.astype(jnp.int32)
+
+
 def _begun(problem: FrameProblem) -> Float[Array, "all_vertices 3"]:
     """Return where the ways of cloth, and of the body behind it, begin at t [m].
 
@@ -91,7 +96,7 @@ def _begun(problem: FrameProblem) -> Float[Array, "all_vertices 3"]:
     start, touched = body.start, problem.data_of(Collision)
     if touched is not None:
         nearest = touched.nearest
-        may_be = nearest.is_near & (nearest.distances < 0) & free_vertices(problem)
+        may_be = nearest.is_near & (nearest.distances < 0) & problem.garment.vertex_mask
         inside = is_inside(*jax.lax.stop_gradient((may_be, position, start, body.surface)))
         position = jnp.where(inside[:, None], nearest.points + CLEARANCE * nearest.normals, position)
         start = jax.lax.cond(jnp.any(inside), _under_skin, lambda body, _: body, start, body.surface)
@@ -154,7 +159,6 @@ class Meetings(NamedTuple):
     most_near: Int[Array, ""]  # rows that their table would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
     is_passed: Bool[Array, ""] | bool = False  # as pushes did not end
-    is_held: Bool[Array, ""] | bool = False  # something passed that must not be pushed
     most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
     is_far: Bool[Array, ""] | bool = False  # an end was pushed by `_FAR`
 
@@ -171,9 +175,9 @@ class Contact(Term):
     frame would end with are pushed until no pair has met on the straight ways from the frame's start. Cloth that
     starts uncrossed stays so, and vertices that start inside the body are taken out of it. Where ends are pushed
     far, the cloth around has to follow: what was pushed is held by planes with the same barrier, and the frame is
-    solved again. The body yields where its own parts pass through each other (`mesh.parting`). Where that
-    makes no room, or where pinned cloth would have to be pushed, something is let through, and the trajectory
-    says in which frame.
+    solved again. Pinned cloth is pushed where nothing else of a pair can be. The body yields where its own parts
+    pass through each other (`mesh.parting`). Where that makes no room, something is let through, and the
+    trajectory says in which frame.
 
     A derivative takes no notice of the pushes.
 
@@ -231,7 +235,7 @@ class Contact(Term):
             under.T,
             (now - under).T,
             self._meshes(garment, body),
-            garment.vertex_mask & ~garment.is_pinned,
+            _freedom(garment, garment.vertex_mask & ~garment.is_pinned),
             self._num_rows(len(position)),
         )
         return grown.position.T
@@ -341,18 +345,18 @@ class Contact(Term):
     ) -> tuple[Float[Array, "vertices 3"], Meetings]:
         """Return positions at t + 1 [m] that are reached without crossing, and what came of it."""
         count, end = len(position), _with_body(position, problem)
-        start = data.start.T
+        start, is_free = data.start.T, free_vertices(problem)
         ways = end.T - start
         ended = move_clear(
             *jax.lax.stop_gradient((start[:, :count], ways[:, :count], start[:, count:], ways[:, count:])),
             self._meshes(problem.garment, problem.body),
-            free_vertices(problem),
+            _freedom(problem.garment, is_free),
             self._num_rows(count),
         )
         reached = ended.position.T
         pushed = reached - jax.lax.stop_gradient(position)
         length = safe_norm(pushed, axis=1)
-        is_far = jnp.any(length > _FAR)
+        is_far = jnp.any(is_free & (length > _FAR))
         is_held = is_far & (length > _HELD)
         last, is_new = data.held.nearest, is_held[:, None]
         nearest = still_contacts(
@@ -363,7 +367,7 @@ class Contact(Term):
         )
         held = data.held._replace(nearest=jax.lax.stop_gradient(nearest))
         found = data._replace(
-            held=held, is_passed=ended.is_passed, is_held=ended.is_held, most=ended.most, is_far=is_far
+            held=held, is_passed=ended.is_passed, most=ended.most, is_far=is_far
         )
         return position + pushed, found
 
@@ -399,11 +403,7 @@ class Contact(Term):
 
     def is_passed(self, data: Meetings) -> Bool[Array, ""] | None:
         """Return whether something was let through."""
-        return jnp.asarray(data.is_passed | data.is_held)
-
-    def is_unreached(self, data: Meetings) -> Bool[Array, ""] | bool:
-        """Return whether pushes did not end."""
-        return data.is_passed
+        return jnp.asarray(data.is_passed)
 
     def is_far(self, data: Meetings) -> Bool[Array, ""] | bool:
         """Return whether an end was pushed so far that cloth around it has to follow."""

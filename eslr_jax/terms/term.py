@@ -96,10 +96,6 @@ class Term:
         """Return whether `correct` moved cloth so far that the frame is solved once more, from there on."""
         return False
 
-    def is_unreached(self, data: Any) -> Bool[Array, ""] | bool:
-        """Return whether `correct` found no end that is reached: other ends of the frame are then preferred."""
-        return False
-
     def touched(self, problem: FrameProblem, data: Any) -> tuple[Contacts, Float[Array, " vertices"]] | None:
         """Return the points that vertices rub on, and the normal forces at t [N]; None: nothing rubs."""
         return None

@@ -93,6 +93,20 @@ def test_a_pinned_sheet_folds_onto_itself_without_crossing():
     assert_nothing_crosses(trajectory, scene)
 
 
+def test_pins_give_way_to_a_body_that_comes_through_them_and_to_nothing_else():
+    pytest.importorskip("ipctk")
+    is_pinned = np.arange(64) % 8 < 4
+    rise = 4e-3 * np.arange(9)[:, None, None] * np.array([0.0, 1.0, 0.0])  # [m], from 14 mm under the sheet
+    still = drifting_ball(9, speed=0.0, below=0.01)
+    poses = still.replace(positions=still.positions + rise.astype(np.float32))
+    scene = prepare_scene(square(is_pinned=is_pinned), poses)
+    trajectory = simulate(None, scene).trajectory
+    assert_nothing_crosses(trajectory, scene)
+    yielded = np.linalg.norm(trajectory.positions - scene.pin_targets, axis=2)[:, is_pinned].max(axis=1)
+    assert yielded[:3].max() == 0
+    assert 0.012 < yielded[-1] < 0.018
+
+
 @pytest.mark.parametrize("coefficient", [0.1, 0.6])
 def test_a_layer_slides_on_another_by_coulombs_law(coefficient):
     """Both lie on a slope of 25 degrees, whose tangent is .47. The lower one is pinned."""

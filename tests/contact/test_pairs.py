@@ -59,8 +59,8 @@ def test_distances_are_the_ipc_toolkits(is_edge):
 def test_pushed_ends_are_reached_without_crossing_and_those_that_meet_nothing_stay(is_edge):
     table, ids, x = random_rows(is_edge)
     step = np.random.default_rng(2).normal(size=x.shape).astype(np.float32) * 0.012
-    is_free = jnp.asarray(np.arange(len(x)) < 3 * ROWS)  # the last corner of every pair stays
-    ends, lack, _ = pushed_apart(columns(x), columns(x + step), table, is_free, 60)
+    freedom = jnp.asarray(np.arange(len(x)) < 3 * ROWS, int)  # the last corner of every pair stays
+    ends, lack = pushed_apart(columns(x), columns(x + step), table, freedom, 60)
     assert float(lack) < 1e-8  # a pair that only comes near may be left undecided
     ends = np.stack(ends, axis=1)
     np.testing.assert_array_equal(ends[3 * ROWS :], (x + step)[3 * ROWS :])
@@ -93,8 +93,8 @@ def test_gaps_do_not_shrink_below_the_floor(is_edge):
     toward = np.stack(near.offset, axis=1) * np.asarray(1 - 2e-5 / near.distance)[:, None]
     first = ids[: 2 if is_edge else 1]
     x[first] -= toward.astype(np.float32)
-    is_free = jnp.asarray(np.isin(np.arange(len(x)), first))
-    ends, lack, _ = pushed_apart(columns(x), columns(x), table, is_free, 60)
+    freedom = jnp.asarray(np.isin(np.arange(len(x)), first), int)
+    ends, lack = pushed_apart(columns(x), columns(x), table, freedom, 60)
     distance = closest(ends, jnp.asarray(ids), is_edge).distance
     assert float(lack) == 0
     assert float(distance.min()) >= pairs.FLOOR
@@ -110,8 +110,8 @@ def test_what_is_pushed_onto_others_is_pushed_off_them():
     ids[:, : pairs.CHUNK] = np.arange(4)[:, None]
     ids[:, pairs.CHUNK] = np.arange(2, 6)
     edges = pairs.Rows(jnp.asarray(ids), jnp.int32(pairs.CHUNK + 1))
-    is_free = jnp.asarray(np.arange(6) < 4)
-    ends, lack, _ = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), is_free, 60)
+    freedom = jnp.asarray(np.arange(6) < 4, int)
+    ends, lack = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), freedom, 60)
     assert float(lack) == 0
     heights = np.asarray(ends[1]).reshape(3, 2)
     assert heights[0].min() > heights[1].max() + pairs.FLOOR
@@ -119,16 +119,16 @@ def test_what_is_pushed_onto_others_is_pushed_off_them():
     assert heights[1].max() < 0  # the fallen edge moved it
 
 
-@pytest.mark.parametrize("is_held", [False, True])
-def test_what_is_held_on_both_sides_and_meets_is_told(is_held):
+@pytest.mark.parametrize("least", [0, 1])
+def test_what_has_less_freedom_stays_where_the_other_can_be_pushed(least):
     x = np.float32([[0, 1, -10], [0, 1, 10], [-10, 0, 0], [10, 0, 0]]) * 1e-3
     step = np.float32([[0, -3, 0], [0, -3, 0], [0, 0, 0], [0, 0, 0]]) * 1e-3
     edges = EMPTY._replace(ids=EMPTY.ids.at[:, 0].set(jnp.arange(4)), count=jnp.int32(1))
-    is_free = jnp.asarray([not is_held, not is_held, False, False])
-    pushed = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), is_free, 60)
-    assert float(pushed.lack) == 0
-    assert bool(pushed.is_held) == is_held
-    assert np.array_equal(np.stack(pushed.end, axis=1), x + step) == is_held
+    freedom = jnp.asarray([least + 1, least + 1, least, least])
+    ends, lack = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), freedom, 60)
+    assert float(lack) == 0
+    np.testing.assert_array_equal(np.stack(ends, axis=1)[2:], x[2:])
+    assert float(ends[1][:2].min()) > pairs.FLOOR
 
 
 def test_edges_that_slide_past_each_other_are_not_pushed():
@@ -136,9 +136,7 @@ def test_edges_that_slide_past_each_other_are_not_pushed():
     x = np.float32([[-0.017, 0.002, -0.02], [-0.017, 0.002, 0.02], [0, 0, -0.1], [0, 0, 0.1]])
     step = np.float32([[0.034, 0, 0], [0.034, 0, 0], [0, 0, 0], [0, 0, 0]])
     edges = EMPTY._replace(ids=EMPTY.ids.at[:, 0].set(jnp.arange(4)), count=jnp.int32(1))
-    ends, lack, _ = pushed_apart(
-        columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), jnp.ones(4, bool), 60
-    )
+    ends, lack = pushed_apart(columns(x), columns(x + step), pairs.Pairs(EMPTY, edges), jnp.ones(4, int), 60)
     assert float(lack) == 0
     np.testing.assert_array_equal(np.stack(ends, axis=1), x + step)
 

@@ -28,6 +28,8 @@ _STRETCH = 1.5  # of one face in a hundred, from which cloth looks stretched
 _TORN = 2.0  # of a single face, from which it looks torn
 _PENETRATION_MM = 5.0
 _THROUGH_MM = 1.0  # of skin in front of cloth
+# Pinned cloth that gives way is worth a line, and farther a warning: its pins lie in the body.
+_YIELDED_MM, _YIELDED_FAR_MM = 1.0, 20.0
 _SLID_M = 0.25
 _EDGE_SLID_M = 0.2  # of an edge that lies on the skin, as at neck, waist and wrists; sleeves ride up by less
 _LEFT = 0.75  # of the covered skin that cloth should still be near
@@ -62,6 +64,7 @@ def trajectory_report(
         most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
         any, of every tenth simulated frame and the last; None where self-contact is not modelled. `let_through`
         are the frames in which something may have passed through cloth; None where contact is not strict.
+        `pins_yield_mm` is how far pinned cloth was pushed from its place at most; None without pins.
         `refined_frames` are those that `simulate` took again in smaller steps; None where it did not simulate.
     """
     measures = jax.device_get(measure_frames(trajectory.positions, scene))
@@ -101,6 +104,7 @@ def trajectory_report(
         "garments": None if several is None else _garments(trajectory, scene, depth, several),
         **_crossings(trajectory, scene, parts),
         "let_through": None if trajectory.is_passed is None else int(np.sum(trajectory.is_passed)),
+        "pins_yield_mm": _pins_yield_mm(trajectory, scene),
         "refined_frames": None if (own := trajectory.substeps) is None else int(np.sum(own > scene.substeps)),
     }
 
@@ -144,6 +148,15 @@ def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, 
         "crossing_share": float(np.mean(np.array(counts) > 0)),
         "worst_crossing": None if vertex is None else _place(frames[worst], vertex, scene, parts),
     }
+
+
+def _pins_yield_mm(trajectory: Trajectory, scene: Scene) -> float | None:
+    if scene.pin_targets is None:
+        return None
+    is_pinned = np.asarray(scene.garment.is_pinned)
+    targets = np.asarray(scene.pin_targets)[: trajectory.num_frames, is_pinned]
+    away = np.linalg.norm(trajectory.positions[:, is_pinned] - targets, axis=2)
+    return 1e3 * float(np.max(away, initial=0.0))
 
 
 def _real_faces(scene: Scene) -> np.ndarray:
@@ -295,6 +308,10 @@ def describe_report(report: dict[str, Any]) -> Words:
         )
     elif report["let_through"] == 0:
         good.append("nothing passed through cloth on the way from frame to frame")
+
+    if (yielded := report["pins_yield_mm"]) is not None and yielded > _YIELDED_MM:
+        told = warnings if yielded > _YIELDED_FAR_MM else good
+        told.append(f"pinned cloth gave way to what came through it, by up to {yielded:.0f} mm")
 
     slide, frame, coverage = report["slide_m"], report["below_feet_at"], report["coverage"]
     if frame is not None:
