@@ -233,9 +233,7 @@ def pushed_apart(
 
     # What every chunk of rows lacks, before the last push: one more sweep sees whether nothing is left.
     lacks = tuple(
-        jnp.where(
-            jnp.arange(0, kind.ids.shape[1], CHUNK) < kind.count, jnp.asarray(jnp.inf, dtype), 0.0
-        )
+        jnp.where(jnp.arange(0, kind.ids.shape[1], CHUNK) < kind.count, jnp.asarray(jnp.inf, dtype), 0.0)
         for kind, _ in pairs.kinds
     )
     first = (end, lacks, jnp.ones(count, bool), jnp.int32(0))

@@ -366,9 +366,7 @@ class Contact(Term):
             is_held | last.is_near,
         )
         held = data.held._replace(nearest=jax.lax.stop_gradient(nearest))
-        found = data._replace(
-            held=held, is_passed=ended.is_passed, most=ended.most, is_far=is_far
-        )
+        found = data._replace(held=held, is_passed=ended.is_passed, most=ended.most, is_far=is_far)
         return position + pushed, found
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Meetings) -> tuple[Elements, ...]:
