@@ -346,9 +346,11 @@ def test_the_first_bad_frame_is_a_row_of_the_trajectory(scene):
     assert good_frames(ended).num_frames == 1
 
 
-def test_frames_that_tear_cloth_are_simulated_again_in_four_steps():
-    scene = prepare_scene(square(is_pinned=np.array([0, 7])), drifting_ball(13), terms=FAST)
-    pins = scene.pin_targets.at[5:, 7].add(0.4)
+# A corner that is pulled away; and one pulled along the hem, all of which is pinned, so that only its last edge tears.
+@pytest.mark.parametrize(("pinned", "pull"), [([0, 7], 0.4), (range(8), [0.0, 0.0, 0.027])])
+def test_frames_that_tear_cloth_are_simulated_again_in_four_steps(pinned, pull):
+    scene = prepare_scene(square(is_pinned=np.array(pinned)), drifting_ball(13), terms=FAST)
+    pins = scene.pin_targets.at[5:, 7].add(jnp.asarray(pull))
     torn = scene.replace(pin_targets=pins)
     trajectory = simulate(None, torn, config=SOLVER).trajectory
     assert np.asarray(trajectory.substeps).tolist() == [1] + 12 * [4]
