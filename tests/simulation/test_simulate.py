@@ -346,7 +346,7 @@ def test_the_first_bad_frame_is_a_row_of_the_trajectory(scene):
     assert good_frames(ended).num_frames == 1
 
 
-# A corner that is pulled away; and one pulled along the hem, all of which is pinned, so that only its last edge tears.
+# A corner that is pulled away; and one pulled along a hem that is pinned, so that only its last edge tears.
 @pytest.mark.parametrize(("pinned", "pull"), [([0, 7], 0.4), (range(8), [0.0, 0.0, 0.027])])
 def test_frames_that_tear_cloth_are_simulated_again_in_four_steps(pinned, pull):
     scene = prepare_scene(square(is_pinned=np.array(pinned)), drifting_ball(13), terms=FAST)
