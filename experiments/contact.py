@@ -4,7 +4,7 @@
                                   [--frames 100]
     python experiments/contact.py --smoke --out DIR
 
-All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every third
+All is simulated as `eslr simulate` does it: BDF2, put on over the rest pose, a tolerance of 1 %. In every
 frame a referee counts pairs of triangles that intersect, of cloth with the body and of cloth with cloth. A start
 fails where there is one, where the simulator let something through, or where a frame ends with a force of 20
 weights. How far the most stretched face goes is kept, too, and how many frames were simulated in several steps.
@@ -33,7 +33,6 @@ from eslr_jax.types import Scene, Trajectory
 OUTFITS = ("pants+tshirt", "shorts+dress", "underskirt+skirt", "tank+longsleeve", "pants+skirt")
 WORN = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress", *OUTFITS)
 FRAMES = 60
-EVERY = 3  # frames between those that are judged
 MOST_RESIDUAL = 20.0  # [weights]
 NAMES = ("worn", "vertices", "clip", "frames", "start")  # of a row
 
@@ -75,13 +74,12 @@ def judge(scene: Scene, trajectory: Trajectory) -> dict[str, object]:
     assert scene.body is not None
     cloth, skin = scene.garment, np.asarray(scene.body.surface.faces)
     own = np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0]
-    judged = range(SETTLE_FRAMES, scene.num_frames, EVERY)
     pairs = [
         intersecting_pairs(
             np.asarray(trajectory.positions[frame], np.float64), own,
             np.asarray(scene.body.positions[frame], np.float64), skin,
         )
-        for frame in judged
+        for frame in range(SETTLE_FRAMES, scene.num_frames)
     ]  # fmt: skip
     of_body = [int((found >= len(own)).any(axis=1).sum()) for found in pairs]
     of_cloth = [len(found) - count for found, count in zip(pairs, of_body, strict=True)]
