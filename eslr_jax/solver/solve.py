@@ -125,6 +125,12 @@ def _solve(
     if not is_corrected:
         return Solved(_minimum(problem, start, stop, memory), problem.data)
 
+    def passed(data: tuple[Any, ...]) -> Array:
+        found = any_passed(problem.replace(data=data))
+        return jnp.zeros((), bool) if found is None else found
+
+    has_passed = passed(problem.data)  # before the frame: no end will do
+
     def is_going(carry: tuple[Solved, Array]) -> Array:
         (_, data), count = carry
         far = (term.is_far(own) for term, own in zip(problem.terms, data, strict=True))
@@ -144,9 +150,8 @@ def _solve(
         solved = Solved(minimum._replace(position=position, iterations=spent), data)
         # What can't be reached without letting something through is no end for a frame that has another one, and
         # once more does not help it.
-        before, after = (any_passed(now.replace(data=one)) for one in (last.data, data))
-        is_lost = False if after is None else (count > 0) & after
-        is_worse = False if before is None else is_lost & ~before
+        is_lost = (count > 0) & passed(data) & ~has_passed
+        is_worse = is_lost & ~passed(last.data)
         kept = jax.tree.map(lambda old, new: jnp.where(is_worse, old, new), last, solved)
         return kept, jnp.where(is_lost, _PASSES, count + 1)
 

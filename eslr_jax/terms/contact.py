@@ -84,23 +84,25 @@ def _freedom(garment: Garment, is_free: Bool[Array, " vertices"]) -> Int[Array, 
     return garment.vertex_mask.astype(jnp.int32) + is_free.astype(jnp.int32)
 
 
-def _begun(problem: FrameProblem) -> Float[Array, "all_vertices 3"]:
-    """Return where the ways of cloth, and of the body behind it, begin at t [m].
+def _begun(problem: FrameProblem) -> tuple[Float[Array, "all_vertices 3"], Bool[Array, ""] | bool]:
+    """Return where the ways of cloth, and of the body behind it, begin at t [m], and whether cloth comes out.
 
-    That is where they are. But cloth inside the body begins on its skin, and then all of the body under it, as at
-    a scene's start: so cloth that was put inside, or was let through, comes out again.
+    They begin where they are. But cloth inside the body begins on its skin, and then all of the body under it, as
+    at a scene's start: so cloth that was put inside, or was let through, comes out again. On that way it may pass
+    through other cloth.
     """
     body, position = problem.body, problem.position
     if body is None:
-        return position
-    start, touched = body.start, problem.data_of(Collision)
+        return position, False
+    start, touched, comes_out = body.start, problem.data_of(Collision), False
     if touched is not None:
         nearest = touched.nearest
         may_be = nearest.is_near & (nearest.distances < 0) & problem.garment.vertex_mask
         inside = is_inside(*jax.lax.stop_gradient((may_be, position, start, body.surface)))
         position = jnp.where(inside[:, None], nearest.points + CLEARANCE * nearest.normals, position)
-        start = jax.lax.cond(jnp.any(inside), _under_skin, lambda body, _: body, start, body.surface)
-    return jnp.concatenate([position, start])
+        comes_out = jnp.any(inside)
+        start = jax.lax.cond(comes_out, _under_skin, lambda body, _: body, start, body.surface)
+    return jnp.concatenate([position, start]), comes_out
 
 
 def keeps_layers(scene: Scene) -> bool:
@@ -158,6 +160,7 @@ class Meetings(NamedTuple):
     held: BodyContact  # with planes across the pushes of vertices, which keep them where they were pushed to
     most_near: Int[Array, ""]  # rows that their table would have needed
     slip: Float[Array, ""] | float  # [m] in a frame, below which friction sticks
+    comes_out: Bool[Array, ""] | bool  # cloth was inside the body
     is_passed: Bool[Array, ""] | bool = False  # as pushes did not end
     most: Int[Array, ""] | int = 0  # rows that the fullest search of ends would have needed
     is_far: Bool[Array, ""] | bool = False  # an end was pushed by `_FAR`
@@ -252,7 +255,7 @@ class Contact(Term):
     def prepare(self, problem: FrameProblem) -> Meetings:
         """Return the pairs that are near at t."""
         count = len(problem.position)
-        start = _begun(problem)
+        start, comes_out = _begun(problem)
         end = _with_body(start[:count], problem)
         x, y = components(start), components(end)
         is_cloth = jnp.arange(len(start)) < count
@@ -277,7 +280,7 @@ class Contact(Term):
         none = still_contacts(nowhere, nowhere, nowhere[:, 0], jnp.zeros(count, bool))
         held = BodyContact(none, None, self.thickness, stiffness)
         most_near = jnp.maximum(num_used, -(-found.most // _LOOKED_AT))
-        return Meetings(start, near, held, most_near, _friction(problem).slip(problem))
+        return Meetings(start, near, held, most_near, _friction(problem).slip(problem), comes_out)
 
     def _near(
         self,
@@ -401,7 +404,7 @@ class Contact(Term):
 
     def is_passed(self, data: Meetings) -> Bool[Array, ""] | None:
         """Return whether something was let through."""
-        return jnp.asarray(data.is_passed)
+        return jnp.asarray(data.is_passed) | data.comes_out
 
     def is_far(self, data: Meetings) -> Bool[Array, ""] | bool:
         """Return whether an end was pushed so far that cloth around it has to follow."""

@@ -9,8 +9,19 @@ from hard_cases.build import make_cloth, make_scene
 from hard_cases.build import sheet as plain_sheet
 from hard_cases.obstacles import needle
 
-from eslr_jax import SimConfig, prepare_scene, rollout_scene, scene_terms, simulate
+from eslr_jax import (
+    SimConfig,
+    load_body,
+    load_garment,
+    load_motion,
+    pose_body,
+    prepare_scene,
+    rollout_scene,
+    scene_terms,
+    simulate,
+)
 from eslr_jax.pipeline.report.crossing import intersecting_pairs
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.scene import start_integrator
 from eslr_jax.terms import Contact, Damping, Friction
 from eslr_jax.terms.stretch import principal_stretches
@@ -18,7 +29,7 @@ from eslr_jax.terms.stretch import principal_stretches
 
 def assert_nothing_crosses(trajectory, scene, first=0):
     assert int(trajectory.status) == 0
-    assert not trajectory.is_passed.any()
+    assert not trajectory.is_passed[first + 1 :].any()  # the first frame is where it starts
     obstacle = scene.body
     for frame, cloth in enumerate(np.asarray(trajectory.positions)[first:], first):
         body = () if obstacle is None else (obstacle.positions[frame], obstacle.surface.faces)
@@ -50,6 +61,7 @@ def test_cloth_that_starts_inside_the_body_comes_out_of_it(depth):
     scene = scene.replace(initial_state=scene.initial_state.replace(position=inside))
     trajectory = simulate(None, scene).trajectory
     assert_nothing_crosses(trajectory, scene, first=1)
+    assert trajectory.is_passed[1]
     assert float(principal_stretches(trajectory.positions[-1], scene.garment)[0].max()) < 1.2
 
 
@@ -91,6 +103,23 @@ def test_a_pinned_sheet_folds_onto_itself_without_crossing():
     thrown[is_pinned] = 0.0
     trajectory = simulate(None, with_velocity(scene, thrown)).trajectory  # with tables that suffice
     assert_nothing_crosses(trajectory, scene)
+
+
+@pytest.mark.slow
+def test_what_passes_through_a_shirt_on_a_backflip_is_told():
+    """Its thighs pass into its belly, with the cloth between. No frame may take minutes either."""
+    pytest.importorskip("ipctk")
+    body = load_body()
+    poses = with_settling(pose_body(body, load_motion("deepmimic_backflip")), SETTLE_FRAMES, body)
+    scene = prepare_scene(load_garment("tshirt", vertices="1k"), poses, integrator="bdf2")
+    trajectory = simulate(None, scene).trajectory
+    frames = zip(np.asarray(trajectory.positions), np.asarray(scene.body.positions), strict=True)
+    is_crossed = [
+        len(intersecting_pairs(cloth, scene.garment.faces, skin, scene.body.surface.faces)) > 0
+        for cloth, skin in frames
+    ]
+    first = np.flatnonzero(is_crossed)[0]
+    assert trajectory.is_passed[: first + 1].any()
 
 
 def test_pins_give_way_to_a_body_that_comes_through_them_and_to_nothing_else():

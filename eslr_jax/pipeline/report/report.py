@@ -303,8 +303,8 @@ def describe_report(report: dict[str, Any]) -> Words:
 
     if report["let_through"]:
         warnings.append(
-            f"in {report['let_through']} frames parts of the body left cloth no room: something may have passed "
-            "through it"
+            f"in {report['let_through']} frames parts of the body left cloth no room, or cloth came out of them: "
+            "something may have passed through it"
         )
     elif report["let_through"] == 0:
         good.append("nothing passed through cloth on the way from frame to frame")
