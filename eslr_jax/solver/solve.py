@@ -129,7 +129,7 @@ def _solve(
         found = any_passed(problem.replace(data=data))
         return jnp.zeros((), bool) if found is None else found
 
-    has_passed = passed(problem.data)  # before the frame: no end will do
+    has_passed = passed(problem.data)  # by its start already: then no end is better
 
     def is_going(carry: tuple[Solved, Array]) -> Array:
         (_, data), count = carry
