@@ -125,11 +125,11 @@ def _solve(
     if not is_corrected:
         return Solved(_minimum(problem, start, stop, memory), problem.data)
 
-    def passed(data: tuple[Any, ...]) -> Array:
+    def is_passed(data: tuple[Any, ...]) -> Array:
         found = any_passed(problem.replace(data=data))
         return jnp.zeros((), bool) if found is None else found
 
-    has_passed = passed(problem.data)  # by its start already: then no end is better
+    has_passed = is_passed(problem.data)  # by its start already: then no end is better
 
     def is_going(carry: tuple[Solved, Array]) -> Array:
         (_, data), count = carry
@@ -150,8 +150,8 @@ def _solve(
         solved = Solved(minimum._replace(position=position, iterations=spent), data)
         # What can't be reached without letting something through is no end for a frame that has another one, and
         # once more does not help it.
-        is_lost = (count > 0) & passed(data) & ~has_passed
-        is_worse = is_lost & ~passed(last.data)
+        is_lost = (count > 0) & is_passed(data) & ~has_passed
+        is_worse = is_lost & ~is_passed(last.data)
         kept = jax.tree.map(lambda old, new: jnp.where(is_worse, old, new), last, solved)
         return kept, jnp.where(is_lost, _PASSES, count + 1)
 
