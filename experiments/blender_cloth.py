@@ -34,7 +34,7 @@ from eslr_jax.pipeline.formats.point_cache import write_pc2
 from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.contact import keeps_layers
-from eslr_jax.terms.problem import contact_thickness
+from eslr_jax.terms.term import contact_thickness
 from eslr_jax.types import Scene
 
 # Steps per frame, rounds of collision per step: in peers.json the least gap on its own rollout.

@@ -50,7 +50,7 @@ from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.simulate import last_frames
 from eslr_jax.terms import Term, scene_terms
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import FrameProblem
 
 COPIED = {
     "speed": RESULTS / "speed_vs_error.png",

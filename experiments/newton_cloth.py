@@ -37,7 +37,7 @@ from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.contact import keeps_layers
-from eslr_jax.terms.problem import contact_thickness, vertex_masses
+from eslr_jax.terms.term import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
 LABELS = {"vbd": "VBD", "style3d": "Style3D", "xpbd": "XPBD"}

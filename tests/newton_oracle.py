@@ -15,7 +15,7 @@ from scipy.optimize import OptimizeResult, minimize
 
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential
-from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
+from eslr_jax.terms.term import FrameProblem, pin, weight_norm
 from eslr_jax.types import tree_cast
 
 

@@ -16,8 +16,8 @@ from eslr_jax.pipeline.assets import prepare_stored
 from eslr_jax.pipeline.fabrics import beyond_training, garment_material, parse_fabric
 from eslr_jax.pose.motion import still_motion
 from eslr_jax.terms import CLOTH
-from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.terms.stretch import green_strains, stretch_energy, thread_strains
+from eslr_jax.terms.term import vertex_masses
 
 
 @pytest.fixture(scope="module")

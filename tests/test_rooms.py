@@ -1,11 +1,16 @@
 """The house: a room imports only rooms above it, kernels stay pure, and third parties have one door each."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import eslr_jax
 
 PACKAGE = Path(__file__).parents[1] / "eslr_jax"
 
@@ -117,3 +122,48 @@ def test_third_parties_have_one_door(module):
 def test_import_of_the_package_is_light():
     code = "import sys, eslr_jax; assert 'jax' not in sys.modules; eslr_jax.SimConfig"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def own_names(module: str) -> Iterator[str]:
+    """Yield the names that a module gives to something, imports apart."""
+    for node in TREES[module.removeprefix("eslr_jax.")].body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (target.id for target in targets if isinstance(target, ast.Name))
+
+
+def documented_names() -> set[str]:
+    """Return the names of the package and of its Python reference: what a change has to keep, or say."""
+    names = {f"eslr_jax.{name}" for name in eslr_jax.__all__}
+    pages = (PACKAGE.parent / "docs" / "api" / "reference.md").read_text()
+    for module, options in re.findall(r"^::: (\S+)\n((?: .*\n)*)", pages, re.MULTILINE):
+        members = re.search(r"members: \[(.*)\]", options)
+        if members:
+            names |= {f"{module}.{name}" for name in members[1].split(", ")}
+        else:
+            names |= {module, *(f"{module}.{name}" for name in own_names(module) if not name.startswith("_"))}
+    for module in ("eslr_jax.terms", "eslr_jax.pipeline.assets"):
+        names |= {f"{module}.{name}" for name in importlib.import_module(module).__all__}
+    return names
+
+
+def test_documented_names_are_there():
+    for name in documented_names():
+        module, _, attribute = name.rpartition(".")
+        is_module = name.removeprefix("eslr_jax.") in TREES
+        assert is_module or hasattr(importlib.import_module(module), attribute), f"{name} is no longer there"
+
+
+def test_most_tests_import_documented_names_only():
+    """The others test what stands behind: formats, pages and commands have their own files and outputs."""
+    documented, files = documented_names(), sorted(Path(__file__).parent.rglob("test_*.py"))
+
+    def is_public(path: Path) -> bool:
+        taken = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        own = [node for node in taken if node.module and node.module.startswith("eslr_jax")]
+        return all(f"{node.module}.{alias.name}" in documented for node in own for alias in node.names)
+
+    public = [path for path in files if is_public(path)]
+    assert len(public) >= 0.7 * len(files), f"{len(public)} of {len(files)}"

@@ -19,7 +19,7 @@ from eslr_jax.solver.potential import evaluate, potential
 from eslr_jax.solver.preconditioner import solve_stiffness, stiffness
 from eslr_jax.solver.subspace import combine_directions
 from eslr_jax.terms import Collision
-from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.term import FrameProblem, pin
 from eslr_jax.types import ClothState, Garment
 
 

@@ -22,7 +22,7 @@ from eslr_jax.networks.attention import orthogonal_projection
 from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, Topology, feature_sizes
 from eslr_jax.networks.dense import MLP
 from eslr_jax.networks.network import Example, Network, Prediction, Statistics, System
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import FrameProblem
 from eslr_jax.types import ClothState, CoarseEdges
 
 START_GAIN = 0.02  # a new network hardly moves what it corrects or accelerates

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.networks.operators import to_world_edges
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
-from eslr_jax.terms.problem import vertex_masses
+from eslr_jax.terms.term import vertex_masses
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
 DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD, training range)

@@ -18,7 +18,7 @@ from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError
 from eslr_jax.solver.guess import Start
 from eslr_jax.solver.potential import Point
-from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.term import FrameProblem, pin
 from eslr_jax.types import ClothState, Normalizer
 
 Statistics = dict[str, Normalizer]

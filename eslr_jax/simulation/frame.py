@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.simulation.scene import slice_tracks
-from eslr_jax.terms.problem import FrameProblem, MovingBody, SecondOrder, with_terms
+from eslr_jax.terms.term import FrameProblem, MovingBody, SecondOrder, with_terms
 from eslr_jax.types import ClothState, PastState, Scene
 
 

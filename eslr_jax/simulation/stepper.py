@@ -26,7 +26,7 @@ from eslr_jax.solver.potential import (
     potential_terms,
 )
 from eslr_jax.solver.solve import lower_point, solve_frame
-from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
+from eslr_jax.terms.term import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
 
 # [weights] Force up to which BDF2 carries a frame on. A T-shirt's frames end with 0.3, those of a fast dance with

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.numerics import scatter_corners
 from eslr_jax.solver.potential import Point, potential
-from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.term import FrameProblem, pin
 
 _COLLAPSED = 1e-6  # of a face's rest area, below which its normal means nothing
 _OFFSET = 1e-6  # [m] by which the corners of collapsed faces are spread

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from eslr_jax.numerics import components
-from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.term import FrameProblem, pin
 
 
 class Point(NamedTuple):

@@ -11,8 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components
-from eslr_jax.terms.problem import FrameProblem, free_vertices
-from eslr_jax.terms.term import Term
+from eslr_jax.terms.term import FrameProblem, Term, free_vertices
 
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/tried.md)
 _REACH = 0.9  # share of every spring that is inverted; one is exact and needs many terms

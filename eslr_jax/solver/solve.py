@@ -28,7 +28,7 @@ from eslr_jax.solver.lbfgs import Minimum, Stop, minimize, unknown_point
 from eslr_jax.solver.potential import Point, any_passed, corrected, potential
 from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
 from eslr_jax.solver.tangent import LinearSolution, solve_symmetric
-from eslr_jax.terms.problem import FrameProblem, weight_norm
+from eslr_jax.terms.term import FrameProblem, weight_norm
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
 _MOST_ITERATIONS = 2000  # of a frame that is differentiated

@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components, product, segment_sum
 from eslr_jax.solver.preconditioner import hessian_diagonal, sum_diagonals
-from eslr_jax.terms.problem import FrameProblem, free_vertices, pin
-from eslr_jax.terms.term import mesh_corners
+from eslr_jax.terms.term import FrameProblem, free_vertices, mesh_corners, pin
 from eslr_jax.types import Garment
 
 _LEFT, _RIGHT = 2, 3  # the corners of a hinge that no edge joins

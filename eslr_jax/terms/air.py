@@ -26,8 +26,7 @@ from jaxtyping import Array, Float
 from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import Vector3, as_partial, cross3, dot3, gather_corners, safe_normalize, sub3
 from eslr_jax.ranges import Range, check_range
-from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Elements, Term
+from eslr_jax.terms.term import Elements, FrameProblem, Term
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Garment
 

@@ -19,8 +19,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import Vector3, arctan2, cross3, dot3, gather_corners, gather_values, in_memory, sub3
-from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Elements, Term
+from eslr_jax.terms.term import Elements, FrameProblem, Term
 from eslr_jax.types import Garment, Material, Plate
 
 RIGIDITY_PER_STIFFNESS = 0.25

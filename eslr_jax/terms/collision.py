@@ -13,16 +13,16 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.contact.nearest import MAX_APPROACH, approach, clear_of_body, find_both_sides
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import Vector3, components, dot3, in_memory, sub3
-from eslr_jax.terms.problem import (
+from eslr_jax.terms.stretch import contact_excess
+from eslr_jax.terms.term import (
     CONTACT_STIFFNESS,
     CONTACT_THICKNESS,
     STIFFNESS_RANGE,
     THICKNESS_RANGE,
     FrameProblem,
+    Term,
     contact_thickness,
 )
-from eslr_jax.terms.stretch import contact_excess
-from eslr_jax.terms.term import Term
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Contacts, Garment, Obstacle
 

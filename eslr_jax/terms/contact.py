@@ -31,16 +31,17 @@ from eslr_jax.numerics import (
 )
 from eslr_jax.terms.collision import BodyContact, Collision, collision_energies, penetration
 from eslr_jax.terms.friction import Friction, slip_energies
-from eslr_jax.terms.problem import (
+from eslr_jax.terms.stretch import contact_excess
+from eslr_jax.terms.term import (
     CONTACT_STIFFNESS,
     STIFFNESS_RANGE,
     THICKNESS_RANGE,
+    Elements,
     FrameProblem,
     MovingBody,
+    Term,
     free_vertices,
 )
-from eslr_jax.terms.stretch import contact_excess
-from eslr_jax.terms.term import Elements, Term
 from eslr_jax.terms.worn import Worn, parted_body
 from eslr_jax.types import BodyMotion, BodySurface, Garment, Obstacle, Scene
 

@@ -20,9 +20,8 @@ from jaxtyping import Array, Float
 from eslr_jax.numerics import Vector3, gather_corners
 from eslr_jax.ranges import Range
 from eslr_jax.terms.bending import angle_energies, dihedral_angles
-from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.stretch import green_strains, strain_energies, stretch_diagonal
-from eslr_jax.terms.term import Elements, Term
+from eslr_jax.terms.term import Elements, FrameProblem, Term
 from eslr_jax.types import Garment
 
 

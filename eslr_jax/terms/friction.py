@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, components, dot3, in_memory, sub3
 from eslr_jax.ranges import Range
-from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Term
+from eslr_jax.terms.term import FrameProblem, Term
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Contacts
 

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, components, in_memory
 from eslr_jax.ranges import Range
-from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Term
+from eslr_jax.terms.term import FrameProblem, Term
 
 
 @struct.dataclass

@@ -14,9 +14,8 @@ from eslr_jax.contact.ground import clear_of_ground, ground_contacts
 from eslr_jax.errors import ConfigError
 from eslr_jax.ranges import Range, check_number
 from eslr_jax.terms.collision import Barrier, BodyContact, contact_forces
-from eslr_jax.terms.problem import CONTACT_STIFFNESS, CONTACT_THICKNESS, FrameProblem
 from eslr_jax.terms.stretch import contact_excess
-from eslr_jax.terms.term import Term
+from eslr_jax.terms.term import CONTACT_STIFFNESS, CONTACT_THICKNESS, FrameProblem, Term
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Contacts, Garment, Obstacle
 

@@ -28,8 +28,8 @@ from eslr_jax.numerics import components, cross3, dot3, masked_sum, safe_norm, s
 from eslr_jax.terms.bending import hinge_corners, hinge_energies
 from eslr_jax.terms.gravity import gravity_energies
 from eslr_jax.terms.inertia import inertia_energies
-from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.terms.stretch import stretch_energy
+from eslr_jax.terms.term import vertex_masses
 from eslr_jax.types import Garment, Material
 
 _CHUNK = 64  # garment vertices whose distances to all faces are held at once

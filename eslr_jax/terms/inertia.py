@@ -8,8 +8,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, components, dot3, in_memory, sub3
-from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Term
+from eslr_jax.terms.term import FrameProblem, Term
 
 
 @struct.dataclass

@@ -18,8 +18,7 @@ from eslr_jax.numerics import (
     scatter_corners,
     sub3,
 )
-from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Term
+from eslr_jax.terms.term import FrameProblem, Term
 from eslr_jax.types import Garment, Material, Threads
 
 _STIFFEST = 85.2  # [N/m], of the fabrics that networks are trained on (HOOD's ranges)

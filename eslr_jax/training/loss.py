@@ -14,7 +14,7 @@ from eslr_jax.networks.network import Network
 from eslr_jax.solver.guess import Start, pushed_out_guess
 from eslr_jax.solver.potential import potential_terms
 from eslr_jax.solver.solve import solve
-from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.term import FrameProblem, pin
 from eslr_jax.types import ClothState
 
 _FALL = 0.01  # [m]; the loss of set "consistent" is in units of the work of lifting the garment by this

@@ -24,8 +24,8 @@ from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.potential import potential_terms
 from eslr_jax.terms import Collision, Contact, Ground, hood, scene_terms
-from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.stretch import principal_stretches
+from eslr_jax.terms.term import FrameProblem
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import Slot, empty_pool, start_trajectory, turn_round

@@ -17,8 +17,8 @@ from eslr_jax.solver.potential import potential
 from eslr_jax.solver.solve import solve
 from eslr_jax.terms import Bending, Gravity, Inertia, Stretch
 from eslr_jax.terms.bending import bending_energy
-from eslr_jax.terms.problem import FrameProblem, pin, vertex_masses, with_terms
 from eslr_jax.terms.stretch import principal_stretches, stretch_energy
+from eslr_jax.terms.term import FrameProblem, pin, vertex_masses, with_terms
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.case import Run
 from hard_cases.colliders import triangle_distances

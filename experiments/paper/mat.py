@@ -29,7 +29,7 @@ from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
 from eslr_jax.networks.attention import linear_attention, orthogonal_projection, relu_features
 from eslr_jax.networks.network import System
 from eslr_jax.terms import Collision
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene
 from paper.mat_space import (
     Change,

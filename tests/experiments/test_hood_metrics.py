@@ -9,7 +9,7 @@ from hard_cases.build import make_scene
 from paper.hood_metrics import hood_metrics
 
 from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
-from eslr_jax.terms.problem import vertex_masses
+from eslr_jax.terms.term import vertex_masses
 
 FRAMES = 4
 

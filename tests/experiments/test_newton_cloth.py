@@ -25,7 +25,7 @@ from eslr_jax.fabric.materials import COTTON
 from eslr_jax.terms import Collision
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.collision import contact_forces
-from eslr_jax.terms.problem import contact_thickness
+from eslr_jax.terms.term import contact_thickness
 from eslr_jax.types import Contacts
 
 SOLVERS = [Setting("vbd", 2, 10), Setting("style3d", 2, 10), Setting("xpbd", None, 1)]

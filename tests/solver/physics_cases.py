@@ -16,7 +16,7 @@ from eslr_jax.numerics import to_device
 from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Stretch
 from eslr_jax.terms.collision import BodyContact
 from eslr_jax.terms.friction import Rubbing
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import FrameProblem
 from eslr_jax.types import Contacts, Garment
 
 TIMESTEP = 1 / 30

@@ -13,8 +13,8 @@ from eslr_jax.fabric.materials import COTTON
 from eslr_jax.solver.potential import contact_load, potential, potential_terms
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.bending import bending_energy, dihedral_angles
-from eslr_jax.terms.problem import weight_norm, with_terms
 from eslr_jax.terms.stretch import principal_stretches, stretch_diagonal, stretch_energy
+from eslr_jax.terms.term import weight_norm, with_terms
 
 TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction")  # the oracle's order
 

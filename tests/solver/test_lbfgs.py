@@ -16,8 +16,8 @@ from eslr_jax.solver.potential import Point, potential
 from eslr_jax.solver.preconditioner import Stiffness, solve_stiffness, stiffness, stretched_stiffness
 from eslr_jax.solver.solve import lower_point
 from eslr_jax.solver.subspace import combine_directions
-from eslr_jax.terms.problem import weight_norm
 from eslr_jax.terms.stretch import stretch_energy
+from eslr_jax.terms.term import weight_norm
 
 
 def diagonal_of(values):

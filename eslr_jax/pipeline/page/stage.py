@@ -19,7 +19,7 @@ from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.simulate import share_programs
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.terms import Air, Elements, Term, scene_terms
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import FrameProblem
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene
 
 MOST_ITERATIONS = 100

@@ -20,8 +20,7 @@ from eslr_jax.pipeline.report.run import Run, run_trajectory
 from eslr_jax.solver.guess import Start, pushed_out_guess
 from eslr_jax.solver.potential import potential
 from eslr_jax.solver.solve import solve
-from eslr_jax.terms.problem import FrameProblem, pin
-from eslr_jax.terms.term import vertex_shares
+from eslr_jax.terms.term import FrameProblem, pin, vertex_shares
 from eslr_jax.types import Scene, Trajectory
 
 # Energy lost to air and damping belongs to a frame, not to a shape.

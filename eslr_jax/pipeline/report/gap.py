@@ -20,7 +20,7 @@ from eslr_jax.solver.guess import Start
 from eslr_jax.solver.lbfgs import unknown_point
 from eslr_jax.solver.potential import potential
 from eslr_jax.solver.solve import solve
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import FrameProblem
 from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison

@@ -23,7 +23,7 @@ from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.simulate import enlarge_buffers
 from eslr_jax.simulation.stepper import buffer_demands
 from eslr_jax.solver.potential import contact_load, evaluate, potential_terms
-from eslr_jax.terms.problem import FrameProblem, weight_norm
+from eslr_jax.terms.term import FrameProblem, weight_norm
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 
