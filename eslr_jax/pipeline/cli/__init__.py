@@ -49,6 +49,7 @@ def main() -> None:
                 app.cli(prog="eslr")()
         finally:
             sys.stdout.flush()  # here, where a broken pipe is still caught
+            gc.freeze()  # else Python looks through all objects once more before it ends, for a third of a second
     except BrokenPipeError:
         # Who reads the output, such as `head`, has enough of it. Python flushes once more when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
