@@ -15,7 +15,7 @@ from eslr_jax.pipeline.report.scene_parts import Name, time_in_turns
 from eslr_jax.pose.motion import pose_body
 from eslr_jax.simulation.plan import first_frames, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import FAST
+from eslr_jax.terms import FAST, Term, scene_terms
 from eslr_jax.types import Scene
 
 _TIMED = ("tshirt", "cmu_016_22")  # a garment, and a clip of the training split
@@ -25,23 +25,37 @@ _TURNS = 9  # timings of each, in turns; medians count
 
 
 def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) -> Calibration:
-    """Time the solver, and the solver behind each bundled network, at some sizes of a garment."""
+    """Time the solver, and the solver behind each bundled network, at some sizes of a garment.
+
+    The scene has what `eslr simulate` models.
+    """
     has_coarse_edges = read_coarse_edges(models)
     garment, clip = _TIMED
     costs: list[Cost] = []
     for size in sizes:
-        scene = example_scene(garment, size, clip, _TIMED_FRAMES, has_coarse_edges=has_coarse_edges)
+        scene = example_scene(
+            garment, size, clip, _TIMED_FRAMES, terms=scene_terms(), has_coarse_edges=has_coarse_edges
+        )
         costs += measure_costs((SOLVER, *models), scene)
     return Calibration(device_name(), tuple(costs))
 
 
 def example_scene(
-    garment: str, size: str, clip: str, num_frames: int = 60, *, has_coarse_edges: bool = False
+    garment: str,
+    size: str,
+    clip: str,
+    num_frames: int = 60,
+    *,
+    terms: tuple[Term, ...] = FAST,
+    has_coarse_edges: bool = False,
 ) -> Scene:
-    """Prepare a bundled garment on a bundled clip, with the coarse edges that a hierarchical network reads."""
+    """Prepare a bundled garment on a bundled clip, with the coarse edges that a hierarchical network reads.
+
+    By default nothing is pushed: so a gap is measured.
+    """
     poses = pose_body(load_body(), load_motion(clip), num_frames=num_frames)
     cloth = load_garment(garment, vertices=size, has_coarse_edges=has_coarse_edges)  # type: ignore[arg-type]
-    return prepare_scene(cloth, poses, terms=FAST)  # a gap is measured where nothing is pushed
+    return prepare_scene(cloth, poses, terms=terms)
 
 
 def read_coarse_edges(names: tuple[str, ...]) -> bool:
