@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from trimesh.exchange.ply import load_ply
 
 from eslr_jax.errors import MeshError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, split_seams, write_frames
@@ -17,6 +16,8 @@ from eslr_jax.pipeline.formats.registry import reader, writer
 @reader("mesh", [".ply"])
 def read_ply(path: Path, _like: MeshFile | None = None) -> MeshFile:
     """Read the positions and faces of a PLY file."""
+    from trimesh.exchange.ply import load_ply  # all of trimesh, for which every command would wait
+
     with path.open("rb") as stream:
         # A count that the file is too small for: trimesh would allocate it.
         for line in stream.read(1 << 16).partition(b"end_header")[0].splitlines():

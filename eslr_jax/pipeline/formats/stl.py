@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from trimesh.exchange.stl import load_stl
 
 from eslr_jax.pipeline.formats.mesh import MeshFile, shared_vertices
 from eslr_jax.pipeline.formats.registry import reader
@@ -14,6 +13,8 @@ from eslr_jax.pipeline.formats.registry import reader
 @reader("mesh", [".stl"])
 def read_stl(path: Path, _like: MeshFile | None = None) -> MeshFile:
     """Read an STL file, all solids as one mesh, and share its vertices."""
+    from trimesh.exchange.stl import load_stl  # all of trimesh, for which every command would wait
+
     with path.open("rb") as stream:
         content = load_stl(stream)
     solids = list(content.get("geometry", {}).values()) or [content]  # text files nest several
