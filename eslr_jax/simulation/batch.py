@@ -144,7 +144,7 @@ def simulate_scenes(
         together = rollout_scenes(params, stacked, config, batch_size=batch_size, mesh=mesh)
         for row, i in enumerate(group):
             one = jax.tree.map(lambda leaf, row=row: leaf[row], together)
-            if (larger := enlarge_buffers(scenes[i], one)) is not None:
+            if (larger := enlarge_buffers(scenes[i], one.demands)) is not None:
                 one = simulate(params, larger, config=config, raises=False).trajectory
                 one = hold_last(one, scenes[i].num_frames)  # it ends where something else goes wrong
             done[i] = one

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
@@ -94,7 +94,7 @@ def simulate(
             jax.device_put(params), scene, config, done, pace, on_frames, is_stopping
         )
         passes.append(spent)
-        larger, kept = enlarge_buffers(scene, trajectory), good_frames(trajectory)
+        larger, kept = enlarge_buffers(scene, trajectory.demands), good_frames(trajectory)
         if larger is not None and is_stopping():  # what overflowed is simulated when somebody goes on
             trajectory, larger = kept, None
         done = kept if kept.num_frames > 1 else None  # what fitted stands
@@ -283,16 +283,16 @@ def _without_frames(scene: Scene) -> Scene:
     return without_tracks(scene).replace(num_frames=_chunk_of(scene) + 1)
 
 
-def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
-    """Return the scene with larger buffers where a rollout had too little room in one, else None.
+def enlarge_buffers(scene: Scene, demands: Mapping[str, Int[ArrayLike, "*frames"]]) -> Scene | None:
+    """Return the scene with larger buffers where frames had too little room in one, else None.
 
     Args:
         scene: The scene that was simulated.
-        trajectory: What came of it.
+        demands: Of the trajectory, or of a frame's report.
     """
     larger = []
     for term in scene.terms:
-        demand = trajectory.demands.get(term.name)
+        demand = demands.get(term.name)
         larger.append(None if demand is None else term.enlarged(int(np.max(np.asarray(demand)))))
     if all(one is None for one in larger):
         return None

@@ -9,7 +9,16 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax import scene_terms
 from eslr_jax.fabric.materials import COTTON, fabric_material
-from eslr_jax.pipeline.page.stage import advance, changed, grasp, nearest_vertex, no_hand, set_stage
+from eslr_jax.pipeline.page.stage import (
+    Stage,
+    advance,
+    changed,
+    enlarged,
+    grasp,
+    nearest_vertex,
+    no_hand,
+    set_stage,
+)
 from eslr_jax.pose.motion import there_and_back
 from eslr_jax.simulation.program import _program
 from eslr_jax.terms import Contact
@@ -52,6 +61,15 @@ def test_a_motion_is_played_forth_and_back():
     assert frames == [(0, 1), (1, 2), (2, 3), (3, 2), (2, 1), (1, 0), (0, 1), (1, 2)]
     after_two = [there_and_back(step, 5, 2) for step in range(7)]
     assert after_two == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 3), (3, 2), (2, 3)]
+
+
+def test_a_frame_that_had_too_little_room_gets_a_larger_stage(stage):
+    scenes = (scene.replace(terms=(*scene.terms, Contact(rows=512))) for scene in stage[:2])
+    tight = Stage(*scenes, stage.inputs, stage.back)
+    _, (report, *_) = played(stage, 1)
+    assert enlarged(tight, report._replace(demands={"contact": jnp.int32(512)})) is None
+    larger = enlarged(tight, report._replace(demands={"contact": jnp.int32(513)}))
+    assert [one.term(Contact).rows for one in (larger.scene, larger.constant)] == [1024, 1024]
 
 
 def test_the_step_that_is_compiled_early_is_the_one_that_runs(opening):

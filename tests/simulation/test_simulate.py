@@ -273,7 +273,7 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
     assert Status.SELF_CONTACT_OVERFLOW in Status(int(short.status))
     with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ rows or more"):
         raise_for_status(short)
-    assert enlarge_buffers(few, short).term(Contact).rows > 512
+    assert enlarge_buffers(few, short.demands).term(Contact).rows > 512
     waits = slow_first_program(monkeypatch, 5.0)
     found = simulate(None, few, config=SOLVER)
     assert len(waits) > 1, "a program for every buffer"
@@ -283,7 +283,7 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
     expected = rollout_scene(None, found.scene, SOLVER)
     assert Status(int(expected.status)) == Status.OK
     np.testing.assert_allclose(found.trajectory.positions, expected.positions, atol=1e-5)
-    assert enlarge_buffers(found.scene, expected) is None
+    assert enlarge_buffers(found.scene, expected.demands) is None
     stopped = simulate(None, few, config=SOLVER, is_stopping=lambda: True)
     assert stopped.trajectory.num_frames == 1, "whoever stops is not told of buffers that would have grown"
     assert Status(int(stopped.trajectory.status)) == Status.OK
@@ -294,7 +294,7 @@ def test_buffers_double_until_they_hold_the_fullest_frame_and_half_as_much_more(
     for most, rows in ((513, 1024), (1500, 4096), (600, 1024)):
         demand = jnp.array([0] * 5 + [most] + [10] * 8)
         full = whole.replace(demands={"contact": demand}, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
-        assert enlarge_buffers(tight, full).term(Contact).rows == rows
+        assert enlarge_buffers(tight, full.demands).term(Contact).rows == rows
     with pytest.raises(CapacityError, match="600 rows or more"):
         raise_for_status(full)
     full = full.replace(first_bad_frame=jnp.int32(5))

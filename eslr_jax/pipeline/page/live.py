@@ -35,6 +35,7 @@ from eslr_jax.pipeline.page.stage import (
     Stage,
     advance,
     changed,
+    enlarged,
     grasp,
     nearest_vertex,
     no_hand,
@@ -207,6 +208,9 @@ def _one_frame(live: Live, choice: Choice) -> bool:
         tolerance = 0.01 * float(live.controls["tolerance"].value)  # of the gap that a frame begins with
         stepped = advance(stage, live.state, (before, frame), live.iterations, tolerance)
         state, report = jax.block_until_ready(stepped)
+    if (larger := enlarged(cast.stage, report)) is not None:  # the same frame once more
+        live.cast, live.is_compiled = dataclasses.replace(cast, stage=larger), False
+        return False
     status = Status(int(state.status))
     if status != Status.OK:
         restart(live)

@@ -16,7 +16,7 @@ from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import step_frame
-from eslr_jax.simulation.simulate import share_programs
+from eslr_jax.simulation.simulate import enlarge_buffers, share_programs
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.terms import Air, Elements, Term, scene_terms
 from eslr_jax.terms.term import FrameProblem
@@ -116,6 +116,14 @@ def advance(
     frame = jax.tree.map(lambda leaf: leaf[row], inputs)
     arguments = (stage.constant, state, frame, jnp.int32(iterations), jnp.float32(tolerance))
     return find_program(_step, arguments, config=_CONFIG).wait()(*arguments)
+
+
+def enlarged(stage: Stage, report: FrameReport) -> Stage | None:
+    """Return the stage with larger buffers where a frame had too little room in one, else None."""
+    scene, constant = (enlarge_buffers(one, report.demands) for one in (stage.scene, stage.constant))
+    if scene is None or constant is None:
+        return None
+    return stage._replace(scene=scene, constant=constant)
 
 
 def _step(

@@ -178,7 +178,7 @@ def score_trajectory(
     before = trajectory
     trajectory = with_energies(before, scene)
     # Those that `simulate` begins with are small.
-    if (larger := enlarge_buffers(scene, trajectory)) is not None:
+    if (larger := enlarge_buffers(scene, trajectory.demands)) is not None:
         scene = larger
         trajectory = with_energies(before, scene)
     report = trajectory_report(trajectory, scene, parts=parts, poses=poses, outfit=outfit)
