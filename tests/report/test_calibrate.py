@@ -50,8 +50,8 @@ def test_costs_grow_with_the_garment_from_the_nearest_size_and_with_substeps():
 
 def test_an_iteration_costs_the_same_behind_every_method():
     """Two speeds of the machine, one per turn, and one disturbed timing."""
-    times = {("solver", 10): [7.0, 14.0, 7.0, 7.0], ("solver", 60): [22.0, 44.0, 22.0, 22.0]}
-    times |= {("net", 10): [9.0, 18.0, 9.0, 9.0], ("net", 60): [24.0, 48.0, 24.0, 90.0]}
+    times = {("solver", 20): [10.0, 20.0, 10.0, 10.0], ("solver", 60): [22.0, 44.0, 22.0, 22.0]}
+    times |= {("net", 20): [12.0, 24.0, 12.0, 12.0], ("net", 60): [24.0, 48.0, 24.0, 90.0]}
     fixed, iteration = fit_costs(times)
     assert iteration == pytest.approx(0.3)
     assert fixed == pytest.approx({"solver": 4.0, "net": 6.0})
@@ -61,8 +61,8 @@ def test_methods_are_compared_within_turns():
     """Turns that take longer for all, and one in which the first method alone was disturbed."""
     added = np.array([0.0, 3.0, 0.0, 5.0, 8.0])
     disturbed = np.array([9.0, 3.0, 0.0, 5.0, 8.0])
-    times = {("solver", 10): 7.0 + disturbed, ("solver", 60): 22.0 + disturbed}
-    times |= {("net", 10): 9.0 + added, ("net", 60): 24.0 + added}
+    times = {("solver", 20): 10.0 + disturbed, ("solver", 60): 22.0 + disturbed}
+    times |= {("net", 20): 12.0 + added, ("net", 60): 24.0 + added}
     fixed, _ = fit_costs({run: list(values) for run, values in times.items()})
     assert fixed["net"] - fixed["solver"] == pytest.approx(2.0)
 
