@@ -75,13 +75,13 @@ def measure_costs(names: tuple[str, ...], scene: Scene) -> list[Cost]:
 def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, float], float]:
     """Return every method's fixed cost per frame, and the cost of an iteration [ms].
 
-    `times` are milliseconds per frame, turn by turn, by method and number of iterations. An iteration is the
-    same for every method, so all share one cost. The fixed cost of a method is that of the first one plus their
-    difference, which is taken within turns: a machine that changes its speed during the measurement then favours
-    none.
+    `times` are milliseconds per frame, turn by turn, by method and one of two numbers of iterations. An
+    iteration is the same for every method, so all share one cost. The fixed cost of a method is that of the first
+    one plus their difference, which is taken within turns: a machine that changes its speed during the
+    measurement then favours none.
     """
     names = list(dict.fromkeys(name for name, _ in times))
-    low, high = _TIMED_ITERATIONS
+    low, high = sorted({count for _, count in times})
     slopes = [np.subtract(times[name, high], times[name, low]) / (high - low) for name in names]
     iteration_ms = float(np.median(slopes))
     rests = {
