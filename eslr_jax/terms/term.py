@@ -15,11 +15,10 @@ from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import Vector3, gather_corners, safe_norm, segment_sum
 from eslr_jax.ranges import Range, check_number
-from eslr_jax.types import BodySurface, Garment, Material
+from eslr_jax.types import BodyMotion, BodySurface, Contacts, Garment, Material, Obstacle
 
 if TYPE_CHECKING:
     from eslr_jax.terms.worn import Worn
-    from eslr_jax.types import BodyMotion, Contacts, Obstacle
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
 # [J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt. A stiffer

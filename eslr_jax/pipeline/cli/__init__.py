@@ -7,6 +7,7 @@ of its options, and calling it does what it says.
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -32,6 +33,7 @@ def main() -> None:
     """Run the command line."""
     # Tracing makes many small objects that stay: looking at them after every 700 takes an eighth of its time.
     gc.set_threshold(50_000)
+    atexit.register(gc.freeze)  # else Python looks through all of them once more before it ends
     # XLA asks whoever compiles for two minutes to file a bug. Its errors become exceptions; its log says no more.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # JAX, which reads it, is not imported yet
     warnings.filterwarnings("ignore", category=DeprecationWarning)
@@ -49,7 +51,6 @@ def main() -> None:
                 app.cli(prog="eslr")()
         finally:
             sys.stdout.flush()  # here, where a broken pipe is still caught
-            gc.freeze()  # else Python looks through all objects once more before it ends, for a third of a second
     except BrokenPipeError:
         # Who reads the output, such as `head`, has enough of it. Python flushes once more when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
